@@ -39,8 +39,8 @@ from projservo_cli.stages import record as recording
 from projservo_cli.stages import servo as driving
 from projservo_cli.stages.external_robot import plugin_robot
 from projservo_cli.stages.stage_inputs import Estimation, RefitInputs, Trials
-from projservo_cli.store import load as stored_run
-from projservo_cli.store import run_path
+from projservo_cli.store.run_file import load as stored_run
+from projservo_cli.store.run_file import run_path
 from projservo_cli.store.sweep_table import TABLE, SweepTable
 from projservo_cli.sweeps.design import Design, require_sound
 from projservo_cli.sweeps.engine import Engine

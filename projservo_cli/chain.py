@@ -19,6 +19,7 @@ from projservo_cli.config.inputs import (
     servo_inputs,
     suggestion_inputs,
 )
+from projservo_cli.dependencies import STAGES, Step, inputs_of, key_of_calibration, result_of, steps_for
 from projservo_cli.geometry.jit import CACHE_FOLDER
 from projservo_cli.laws import CODES, POINT_LAWS, law_and_mode, must_converge, run_name
 from projservo_cli.progress import Listener
@@ -26,8 +27,7 @@ from projservo_cli.records import Action, FloatArray, InputError, JointList, Pla
 from projservo_cli.result_hashes import digest
 from projservo_cli.settings.task import TaskStep
 from projservo_cli.stages.stage_inputs import CarryingObject, PlanInputs, ServoInputs
-from projservo_cli.steps import STAGES, Step, inputs_of, key_of_calibration, result_of, steps_for
-from projservo_cli.store import SERVO, Run, save
+from projservo_cli.store.run_file import SERVO, Run, save
 
 if TYPE_CHECKING:
     from projservo_cli.robots.session import Session

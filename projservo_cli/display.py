@@ -52,7 +52,7 @@ class Displayable(Printed):
         InputError
             If xarray is not installed.
         """
-        from projservo_cli.store import dataset_of
+        from projservo_cli.store.run_file import dataset_of
 
         xarray()
         return dataset_of(self.record).assign_coords(self.coordinates())

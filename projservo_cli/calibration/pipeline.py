@@ -11,6 +11,7 @@ from scipy.special import chdtri
 from threadpoolctl import threadpool_limits
 
 from projservo_cli.calibration.bundle_adjustment import LeastSquares
+from projservo_cli.calibration.checks.joint_order import require_poses
 from projservo_cli.calibration.checks.model_error import ModelCheck
 from projservo_cli.calibration.checks.numbering import checked_geometry
 from projservo_cli.calibration.checks.outliers import (
@@ -31,7 +32,6 @@ from projservo_cli.calibration.checks.refusal import (
     refusal,
     straight_joints,
 )
-from projservo_cli.calibration.checks.undecided import require_poses
 from projservo_cli.calibration.detections import (
     Detections,
     require_images,

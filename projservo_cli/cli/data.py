@@ -350,8 +350,8 @@ def _validate(
     from projservo_cli.calibration.checks.validation import residual_statistics
     from projservo_cli.config import load_config
     from projservo_cli.records import WorkFailed
-    from projservo_cli.store import load
     from projservo_cli.store.observation_tables import read_detections, read_table
+    from projservo_cli.store.run_file import load
 
     found = load(target)
     calibration = found.calibration

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from projservo_cli.records import FloatArray
     from projservo_cli.robots.contract import PluginRobot
     from projservo_cli.stages.doctor import Checked
-    from projservo_cli.store import Run
+    from projservo_cli.store.run_file import Run
 
 _SIZE_MM = 30.0  # of tags: what webcams at arm's length see with 25 px and more
 _BODIES = ("roof", "plate")
@@ -198,7 +198,7 @@ def _refit(checked: "Checked", stored: "Run | None", config: str, output: Path) 
 def _note_refuted(path: Path, refuted: str) -> None:
     """Store what contradicts the recording of a run, empty for nothing, if that has changed."""
     from projservo_cli.files import working_in
-    from projservo_cli.store import load, save
+    from projservo_cli.store.run_file import load, save
 
     with working_in(path.parent):
         run = load(path)

@@ -27,7 +27,7 @@ def _show(console: Console, *, run: Path | None, output: Path | None) -> None:
     target = option.one_run("show", run, output) or Path("results", "paper")
     from projservo_cli.config import load_config
     from projservo_cli.report.report_data import stage_object
-    from projservo_cli.store import load
+    from projservo_cli.store.run_file import load
 
     found = load(target)
     config = load_config(found.path, text=found.configuration)
@@ -78,7 +78,7 @@ def _compare(console: Console, *, runs: tuple[Path, ...], output: Path, force: b
     from projservo_cli.config import load_config
     from projservo_cli.config.inputs import about_of
     from projservo_cli.report.page import write_comparison
-    from projservo_cli.store import load
+    from projservo_cli.store.run_file import load
 
     if output.suffix != ".html":
         raise click.UsageError(f"{output}: name a page to write, such as {output.name or 'runs'}.html")
@@ -159,7 +159,7 @@ def _export(
     other way, ends in exit code 1, and so does a known length that contradicts its links or a prismatic
     joint, or puts a camera beyond 20 m.
     """
-    from projservo_cli.store import load
+    from projservo_cli.store.run_file import load
 
     found = load(run)
     folder = output or found.path.parent / to

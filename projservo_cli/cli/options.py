@@ -16,7 +16,7 @@ from projservo_cli.cli.output import Console
 
 if TYPE_CHECKING:
     from projservo_cli.config import Config, Override
-    from projservo_cli.store import Run
+    from projservo_cli.store.run_file import Run
 
 _Function = Callable[..., Any]
 
@@ -128,7 +128,7 @@ def configured(
     Raises UsageError where a robot is named by the run alone, which starts no code.
     """
     from projservo_cli.config import load_config, shipped
-    from projservo_cli.store import stored
+    from projservo_cli.store.run_file import stored
 
     held = None if config or run is None else stored(run)
     if held is None or not held.configuration:
@@ -144,7 +144,7 @@ def configured(
 
 def calibrated_run(run: Path | None, config: "Config") -> "Run | None":
     """The run that is named, by default that of the configuration's name; None without a calibration."""
-    from projservo_cli.store import stored
+    from projservo_cli.store.run_file import stored
 
     found = stored(run or RESULTS / config.name)
     if run is not None and not found.path.exists():

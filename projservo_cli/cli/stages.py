@@ -16,7 +16,7 @@ from projservo_cli.cli.program import FAILED, main
 if TYPE_CHECKING:
     from projservo_cli.chain import Chain
     from projservo_cli.config import Config
-    from projservo_cli.store import Run
+    from projservo_cli.store.run_file import Run
 
 _NAMING = {"plant": {"plant", "plant.use"}, "law": {"control", "control.laws"}}  # keys of --set
 _AGAIN = ", and the robot is not moved: --force records all poses again"
@@ -296,7 +296,7 @@ def _report(stages: Sequence[str], console: Console, *, run: Path | None, **opti
     with intervals, final errors, laws compared on the same tasks.
     """
     from projservo_cli.records import InputError
-    from projservo_cli.store import SWEEP, run_path
+    from projservo_cli.store.run_file import SWEEP, run_path
 
     if run is not None and not run.exists():
         raise InputError(
@@ -378,7 +378,7 @@ def _resolve(options: Mapping[str, Any], *, recording: bool = False) -> tuple["C
     it names another.
     """
     from projservo_cli.config import Override, load_config, to_yaml
-    from projservo_cli.store import stored
+    from projservo_cli.store.run_file import stored
 
     if options.get("origin") is not None:
         return _from_sweep(options)
@@ -402,7 +402,7 @@ def _resolve(options: Mapping[str, Any], *, recording: bool = False) -> tuple["C
 def _of_refit(options: Mapping[str, Any]) -> tuple["Config", "Run"]:
     """Configuration of a run with a camera fitted again, and another run that holds its calibration."""
     from projservo_cli.config import Override, load_config, stored_yaml
-    from projservo_cli.store import Run, load, run_path, stored
+    from projservo_cli.store.run_file import Run, load, run_path, stored
 
     flag, before = f"--refit {options['refit']}", load(options["run"])
     if not options["data"] or not options["output"]:
@@ -433,7 +433,7 @@ def _of_refit(options: Mapping[str, Any]) -> tuple["Config", "Run"]:
 def _from_sweep(options: Mapping[str, Any]) -> tuple["Config", "Run"]:
     """Configuration of a run of a sweep, and a run that holds the calibration it was made with."""
     from projservo_cli.config import load_config, to_yaml
-    from projservo_cli.store import Run
+    from projservo_cli.store.run_file import Run
     from projservo_cli.sweeps.folder import run_of
 
     if options["config"]:
@@ -451,7 +451,7 @@ def _from_sweep(options: Mapping[str, Any]) -> tuple["Config", "Run"]:
 def _run_of(options: Mapping[str, Any], config: "Config") -> "Run":
     """The run where the user says, else in the folder of the configuration's name; empty where none is."""
     from projservo_cli.files import require_inside
-    from projservo_cli.store import stored
+    from projservo_cli.store.run_file import stored
 
     folder = options["output"]
     if not folder:

@@ -31,7 +31,7 @@ from projservo_cli.report.report_data import (
     title,
 )
 from projservo_cli.report.style import FORMATS
-from projservo_cli.store import Run
+from projservo_cli.store.run_file import Run
 
 
 def _calibration_words(values: Mapping[str, Any], *, estimated: bool) -> Iterator[str]:

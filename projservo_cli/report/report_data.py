@@ -37,7 +37,7 @@ from projservo_cli.report import style
 from projservo_cli.settings.task import Trajectory
 from projservo_cli.simulation.analytic_plant import Plant
 from projservo_cli.simulation.arm import SerialArm
-from projservo_cli.store import Run
+from projservo_cli.store.run_file import Run
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from projservo_cli.calibration.checks.board_numbering import BoardNumbering
+from projservo_cli.calibration.checks.joint_order import undecided_pairs
 from projservo_cli.calibration.checks.screening import screened
-from projservo_cli.calibration.checks.undecided import undecided_pairs
 from projservo_cli.calibration.checks.validation import cross_validate
 from projservo_cli.calibration.initialization import Nominal
 from projservo_cli.calibration.pipeline import calibrate

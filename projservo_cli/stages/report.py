@@ -53,8 +53,8 @@ from projservo_cli.stages.plan import plan_task
 from projservo_cli.stages.scenario import RunScenario, run_scenario
 from projservo_cli.stages.servo import drive
 from projservo_cli.stages.stage_inputs import ReportInputs, Scenery, ServoInputs
-from projservo_cli.store import Result, Run
 from projservo_cli.store.observation_tables import to_csv
+from projservo_cli.store.run_file import Result, Run
 from projservo_cli.task.body import make_body
 from projservo_cli.task.face import cyclic_order
 from projservo_cli.task.target import is_stereo

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from projservo_cli.records import SIZES, BoolArray, InputError, Trace
-from projservo_cli.store import (
+from projservo_cli.store.run_file import (
     SWEEP,
     as_attribute,
     attribute,

@@ -11,11 +11,12 @@ import time
 import numpy as np
 import pytest
 
-from projservo_cli import cli, store
+from projservo_cli import cli
 from projservo_cli.calibration import calibrate, residual_statistics
 from projservo_cli.metric.position_error import position_errors
 from projservo_cli.records import InputError, WorkFailed
 from projservo_cli.results import ImageModel
+from projservo_cli.store import run_file
 from projservo_cli.store.observation_tables import read_positions, read_table
 from tests.calibration import damage
 
@@ -54,7 +55,7 @@ def fitted(shared_data, tmp_path_factory):
         table = shared_data / "motoman" / "arm2_train.csv"
         words = ["calibrate", "--data", str(table), "-o", str(folder), "-q"]
         assert cli.run([*words, *(["--lens", "--image-size", "6000x4000"] if lens else [])]) == 0
-        found[lens] = store.load(folder).calibration
+        found[lens] = run_file.load(folder).calibration
     return found
 
 

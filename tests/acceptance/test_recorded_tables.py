@@ -5,8 +5,8 @@ import csv
 import numpy as np
 import pytest
 
-from projservo_cli import store
 from projservo_cli.calibration import predict
+from projservo_cli.store import run_file
 from projservo_cli.store.observation_tables import read_table
 
 JOINTS = {"ur5": "RRRRRR", "stanford": "RRPRRR"}
@@ -70,7 +70,7 @@ def test_noise_free_tables_are_explained_to_their_rounding(held_out, robot, meth
     assert calibration["usable"]
     assert calibration["sigma_px"] == 1e-4  # the floor of the estimate
     assert calibration["rms_px"] <= NOISE_FREE[method]
-    assert store.load("out").calibration.method == method
+    assert run_file.load("out").calibration.method == method
 
 
 def rewritten(source, target, rng, columns, marker, pose):
@@ -89,7 +89,7 @@ def rewritten(source, target, rng, columns, marker, pose):
 
 def test_a_table_says_the_same_in_any_order(held_out, answer, shared_data, rng, tmp_path):
     held_out("ur5", "0.5")
-    first = store.load("out").calibration
+    first = run_file.load("out").calibration
     columns = ["v_right", "q3", "marker", "remark", "u_left", *(f"q{i}" for i in (6, 1, 2, 5, 4))]
     columns += ["pose", "u_right", "v_left"]
     table = tmp_path / "other.csv"
@@ -98,7 +98,7 @@ def test_a_table_says_the_same_in_any_order(held_out, answer, shared_data, rng, 
     )
     code, value, err = answer("calibrate", "--data", table, "-o", "other")
     assert (code, value["usable"]) == (0, True), err
-    second = store.load("other").calibration
+    second = run_file.load("other").calibration
     assert sorted(second.marker) == [90 - 7 * m for m in reversed(range(10))]
     q = read_table(shared_data / "ur5" / "validation.csv").q
     order = [list(second.marker).index(90 - 7 * m) for m in first.marker]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from projservo_cli import store
+from projservo_cli.store import run_file
 from tests.conftest import ROOT
 from tests.robots.robots import CALLS
 
@@ -21,7 +21,7 @@ def test_case_05_wrap_360(case, answer):
         assert one["excitation"] == pytest.approx(other["excitation"], abs=1e-6)
     steps = [[row["delta"] for row in value["suggestions"]] for value in (found, plain)]
     assert np.abs(steps).max() < np.radians(60.0)
-    wrapped, other = (store.load(name) for name in "ab")
+    wrapped, other = (run_file.load(name) for name in "ab")
     turns = (wrapped.calibration.joint_min - other.calibration.joint_min) / (2.0 * np.pi)
     np.testing.assert_allclose(turns, np.rint(turns), atol=1e-6)
     np.testing.assert_allclose(np.ptp(wrapped.observation.q, axis=0), wrapped.calibration.excitation)
@@ -102,5 +102,5 @@ def test_a_table_without_an_order_is_planned_with_a_warning_and_drives_no_extern
     code, done, err = answer(*stated)
     assert code == 0, err
     assert done["laws"][0]["verdict"] == "converged"
-    plan = store.load("run").plan
+    plan = run_file.load("run").plan
     assert "order of joints" not in plan.reason

@@ -16,7 +16,7 @@ from projservo_cli.geometry.joint_curve import backwards, slopes, true_joints
 from projservo_cli.geometry.kinematics import backward, forward_between, forward_kinematics, joint_operators
 from projservo_cli.metric.frame import Metric
 from projservo_cli.records import BASIS, NO_CURVE, InputError, JointCurve, Model, WorkFailed, no_lenses
-from projservo_cli.store import Result, Run, load, save
+from projservo_cli.store.run_file import Result, Run, load, save
 from tests.calibration.simulated_robot import around, random_robot, trials
 from tests.calibration.test_cameras_on_the_tool import Hand
 

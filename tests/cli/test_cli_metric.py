@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from projservo_cli import store
 from projservo_cli.cli import run
 from projservo_cli.metric.opencv import opencv_cameras
 from projservo_cli.records import InputError
 from projservo_cli.results import ImageModel
+from projservo_cli.store import run_file
 
 ONES = np.ones(6)
 KNOWN = ["--metric", "0.2492990172463582", "--between", "2,8"]
@@ -33,7 +33,7 @@ def ur5(shared_data, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def metric(ur5):
-    return ImageModel.of(store.load(ur5).calibration).metric(float(KNOWN[1]), (2, 8))
+    return ImageModel.of(run_file.load(ur5).calibration).metric(float(KNOWN[1]), (2, 8))
 
 
 Q = np.array([[0.3, -1.2, 1.1, -0.4, 0.8, 0.2], [0.1, -1.0, 1.4, -0.8, 1.1, -0.6]])
@@ -48,7 +48,7 @@ def export(ur5, tmp_path, kind, *more):
 def test_opencv_reads_the_cameras_and_projects_as_the_model_that_was_fitted(ur5, metric, tmp_path):
     cv2 = pytest.importorskip("cv2")
     file = cv2.FileStorage(str(export(ur5, tmp_path, "opencv")), cv2.FILE_STORAGE_READ)
-    found = opencv_cameras(metric, store.load(ur5).calibration)
+    found = opencv_cameras(metric, run_file.load(ur5).calibration)
     body = found.body
     # The true cameras have no skew, so that this costs what chance does: 14 in one of 1,000 draws.
     assert 0.0 < found.skew_chi2 < 13.9
@@ -198,7 +198,7 @@ def test_cameras_come_in_the_base_of_a_model(ur5, reference_truth, model_of, tmp
         C = np.array(found["poses_covariance"])[v, 3:, 3:]
         assert off @ np.linalg.solve(C, off) < 16.3  # once in a thousand
         assert np.sqrt(np.trace(C)) < 8e-3
-    m = ImageModel.of(store.load(ur5).calibration).metric(float(KNOWN[1]), (2, 8))
+    m = ImageModel.of(run_file.load(ur5).calibration).metric(float(KNOWN[1]), (2, 8))
     there = m.in_frames_of(file)
     np.testing.assert_allclose(face_pixels(there), face_pixels(m), atol=1e-9)
     capsys.readouterr()

@@ -10,7 +10,7 @@ import pytest
 
 from projservo_cli.cli.equations import REGISTER
 from projservo_cli.config import load_config
-from projservo_cli.store import load
+from projservo_cli.store.run_file import load
 
 ROOT = Path(__file__).parents[2]
 

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from projservo_cli.store import load
+from projservo_cli.store.run_file import load
 
 CHAIN = ("record", "calibrate", "plan", "-c", "tiny.yaml", "-o", "out")
 TABLE = Path("out/trials.csv")

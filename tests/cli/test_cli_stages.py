@@ -12,7 +12,7 @@ from projservo_cli.cli.output import Console
 from projservo_cli.report import animation as film
 from projservo_cli.report import page
 from projservo_cli.stages import report as reporting
-from projservo_cli.store import load
+from projservo_cli.store.run_file import load
 
 ALL = ["calibrate", "plan", "direct_three", "stacked", "report"]
 

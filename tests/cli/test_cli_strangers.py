@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from projservo_cli.files import working_in
-from projservo_cli.store import load, save
+from projservo_cli.store.run_file import load, save
 
 ESCAPES = "\x1b[2J\x07\x9b31m\u202egnp.exe\u2028</script><img src=x onerror=alert(1)>"
 

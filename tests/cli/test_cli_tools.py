@@ -8,7 +8,7 @@ import numpy as np
 
 from projservo_cli.config import load_config
 from projservo_cli.config.schema import json_schema
-from projservo_cli.store import load
+from projservo_cli.store.run_file import load
 from tests.report.conftest import read, words
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from projservo_cli import store
+from projservo_cli.store import run_file
 from tests.conftest import ROOT
 
 CONFIGS = ROOT / "configs"
@@ -72,7 +72,7 @@ def test_the_same_seed_makes_identical_arrays_and_running_again_changes_nothing(
     answer = projservo("servo", *PAPER, "--law", "direct_three", "-o", "one", "--json")
     (trace,) = answer.json["laws"]
     assert (answer.code, trace["verdict"]) == (0, "converged")
-    one, first = arrays(store.load("one")), arrays(store.load(first_chain))
+    one, first = arrays(run_file.load("one")), arrays(run_file.load(first_chain))
     assert any(name.startswith("servo/direct_three") for name in one)
     for name, value in one.items():
         np.testing.assert_array_equal(value, first[name], err_msg=name)
@@ -81,4 +81,6 @@ def test_the_same_seed_makes_identical_arrays_and_running_again_changes_nothing(
     assert again.json["servo"]["laws"] == [trace]
     assert Path("one/run.h5").read_bytes() == before
     assert projservo("calibrate", *PAPER, "-o", "two", "--set", "seed=2", "-q").code == 0
-    assert not np.array_equal(store.load("two").observation.images, store.load("one").observation.images)
+    assert not np.array_equal(
+        run_file.load("two").observation.images, run_file.load("one").observation.images
+    )

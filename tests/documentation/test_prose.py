@@ -50,7 +50,7 @@ TERMS = {
     "April ?tag": "detection",
     "backlash": "simulation/faults",
     "bundle adjustment": "calibration/bundle_adjustment",
-    "checks?um|HDF5": "store/__init__",
+    "checks?um|HDF5": "store/run_file",
     "cluster|Dask": "sweeps/engine",
     "covariance": "calibration/prediction",
     "cross-validation": "calibration/checks/validation",

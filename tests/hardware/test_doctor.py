@@ -20,7 +20,7 @@ from projservo_cli.hardware.checks_at_rest import FAULT, FINE, Finding
 from projservo_cli.report.live_page import LivePage
 from projservo_cli.stages import calibrate
 from projservo_cli.stages.doctor import Checked, calibration_finding, with_refit
-from projservo_cli.store import load
+from projservo_cli.store.run_file import load
 from tests.conftest import ROOT
 from tests.hardware.arms_in_motion import Faults, Rail, findings
 from tests.hardware.streams import Stream, picture

@@ -10,11 +10,11 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from projservo_cli import store
 from projservo_cli.cli import run
 from projservo_cli.metric.kinematic_errors import in_model_frames
 from projservo_cli.records import InputError
 from projservo_cli.results import ImageModel
+from projservo_cli.store import run_file
 from tests.calibration.simulated_robot import NAMES, around, random_robot
 from tests.calibration.test_cameras_on_the_tool import Hand
 from tests.metric.test_frame import calibrated, frame  # noqa: F401
@@ -138,7 +138,7 @@ def test_positions_of_the_flange_are_those_of_the_arm(recorded, capsys):
 def test_mujoco_moves_the_cameras_with_the_flange(recorded):
     mujoco = pytest.importorskip("mujoco")
     _, folder = recorded
-    calibration = store.load(folder / "run").calibration
+    calibration = run_file.load(folder / "run").calibration
     metric = ImageModel.of(calibration).metric(hand.TAG, "tags")
     model = mujoco.MjModel.from_xml_path(str(export(folder, "urdf")))
     data, q = mujoco.MjData(model), calibration.q_reference + 0.2

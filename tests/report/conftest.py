@@ -7,7 +7,7 @@ import pytest
 
 from projservo_cli.config import to_yaml
 from projservo_cli.stages import report
-from projservo_cli.store import Result, Run
+from projservo_cli.store.run_file import Result, Run
 from tests.configured import draw_only, report_on
 from tests.known import configured
 from tests.report.cases import SHORT, case

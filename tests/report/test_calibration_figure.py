@@ -8,12 +8,12 @@ from matplotlib.container import BarContainer
 from projservo_cli.calibration import predict
 from projservo_cli.calibration.prediction import parameters_from
 from projservo_cli.config import load_config, to_yaml
+from projservo_cli.dependencies import steps_for
 from projservo_cli.records import Observation
 from projservo_cli.report import style
 from projservo_cli.report.report_data import Fit
 from projservo_cli.robots.frame_recorder import FrameRecorder
-from projservo_cli.steps import steps_for
-from projservo_cli.store import Result, Run
+from projservo_cli.store.run_file import Result, Run
 from tests.configured import calibrate, report_on
 from tests.known import configured
 from tests.report.cases import SPECS, case

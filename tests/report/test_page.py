@@ -14,8 +14,8 @@ from projservo_cli.records import CrossValidation
 from projservo_cli.report.animation import write_animation
 from projservo_cli.report.claims import claims_of
 from projservo_cli.report.report_data import PAGE_FILE, stage_object
-from projservo_cli.store import Result
 from projservo_cli.store.observation_tables import to_csv
+from projservo_cli.store.run_file import Result
 from tests.configured import compared, page_of
 from tests.fake_records import fake
 from tests.report.cases import SPECS, case, seen

@@ -9,7 +9,7 @@ from PIL import Image
 from projservo_cli.records import Trace
 from projservo_cli.report.figures.images import frames_of
 from projservo_cli.robots.frame_recorder import MOST_FRAMES, FrameRecorder
-from projservo_cli.store import load
+from projservo_cli.store.run_file import load
 from tests.fake_records import fake
 from tests.robots.robots import Sound
 from tests.robots.test_servo import NEAR, OPTIONS

@@ -9,7 +9,7 @@ import pytest
 
 from projservo_cli import cli
 from projservo_cli.config import load_config
-from projservo_cli.store import load
+from projservo_cli.store.run_file import load
 from tests.robots.robots import CALLS, Seeing, Sound
 
 CONFIG = Path(__file__).parents[2] / "configs" / "object.yaml"

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from projservo_cli.config import load_config
-from projservo_cli.store import load
+from projservo_cli.store.run_file import load
 from tests.configured import truth_of
 from tests.robots.conftest import UR5
 from tests.robots.robots import CALLS

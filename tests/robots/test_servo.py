@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 import projservo_cli as ps
 from projservo_cli.config import Override, load_config
 from projservo_cli.stages import report
-from projservo_cli.store import load
+from projservo_cli.store.run_file import load
 from tests.configured import scenario_of
 from tests.robots import robots
 from tests.robots.robots import CALLS

@@ -12,7 +12,7 @@ from projservo_cli.report.figures.path_deviation import study_numbers
 from projservo_cli.report.report_data import Composition
 from projservo_cli.stages import report
 from projservo_cli.stages.report import run_studies
-from projservo_cli.store import Result, load, save
+from projservo_cli.store.run_file import Result, load, save
 from tests.configured import draw_only, report_on
 from tests.report.cases import GAINS, PERIODS_S, SPECS, case
 from tests.report.conftest import stored

@@ -14,7 +14,7 @@ from projservo_cli.experiment import Experiment
 from projservo_cli.records import InputError
 from projservo_cli.settings.task import TaskSettings
 from projservo_cli.stages import servo
-from projservo_cli.store import load
+from projservo_cli.store.run_file import load
 from tests.configured import draw_only, truth_of
 from tests.conftest import ROOT
 

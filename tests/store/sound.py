@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from projservo_cli.records import Calibration, CrossValidation, Observation, Plan, Report, Trace
-from projservo_cli.store import Result, Run, save
+from projservo_cli.store.run_file import Result, Run, save
 from tests.conftest import ROOT
 from tests.fake_records import fake
 

@@ -11,8 +11,8 @@ import pytest
 
 from projservo_cli.files import lies_inside, require_inside, working_in
 from projservo_cli.records import InputError
-from projservo_cli.store import save
 from projservo_cli.store.observation_tables import write_table
+from projservo_cli.store.run_file import save
 from tests.configured import compared
 from tests.conftest import ROOT
 from tests.store.sound import sound_run

@@ -8,10 +8,10 @@ import h5py
 import numpy as np
 import pytest
 
-from projservo_cli import store
 from projservo_cli.records import InputError, Plan, Trace
 from projservo_cli.results import RunTrace
-from projservo_cli.store import save_record
+from projservo_cli.store import run_file
+from projservo_cli.store.run_file import save_record
 from tests.fake_records import fake
 from tests.store.deceit import EDITS, HEADS, edited, head, resealed
 from tests.store.sound import result, sound_file, sound_run
@@ -41,7 +41,7 @@ def assert_same(a, b):
 
 def refused(path):
     with pytest.raises(InputError) as caught:
-        store.load(path)
+        run_file.load(path)
     message = str(caught.value)
     assert str(path) in message
     assert "\n" not in message
@@ -51,8 +51,8 @@ def refused(path):
 
 def test_everything_comes_back(tmp_path):
     run = dataclasses.replace(sound_run(tmp_path / "run.h5"), configuration=LONG)
-    store.save(run)
-    back = store.load(tmp_path)
+    run_file.save(run)
+    back = run_file.load(tmp_path)
     assert (back.path, back.configuration, list(back.results)) == (run.path, LONG, list(run.results))
     for name, stored in run.results.items():
         loaded = back.results[name]
@@ -69,8 +69,8 @@ def test_everything_comes_back(tmp_path):
 def test_plans_and_runs_of_any_views_come_back_with_counts_by_name(tmp_path, names):
     trace = fake(Trace, 1, view=names)
     made = {"plan": result(**{"": fake(Plan, 2, view=names)}), "servo/exact": result(**{"": trace})}
-    store.save(store.Run(tmp_path / "run.h5", "", made))
-    back = store.load(tmp_path)
+    run_file.save(run_file.Run(tmp_path / "run.h5", "", made))
+    back = run_file.load(tmp_path)
     assert_same(back.plan, made["plan"].records[""])
     assert_same(back.traces["exact"], trace)
     with h5py.File(tmp_path / "run.h5") as file:
@@ -88,12 +88,12 @@ def test_plans_and_runs_of_any_views_come_back_with_counts_by_name(tmp_path, nam
 
 def test_names_and_arrays_of_views_must_be_as_many(tmp_path):
     trace = dataclasses.replace(fake(Trace), view=("left",), self_occluded_steps=(1,))
-    store.save(store.Run(tmp_path / "run.h5", "", {"servo/exact": result(**{"": trace})}))
+    run_file.save(run_file.Run(tmp_path / "run.h5", "", {"servo/exact": result(**{"": trace})}))
     assert "arrays of 2 views, named left" in refused(tmp_path)
 
 
 def test_xarray_shows_dimensions_units_and_coordinates(path):
-    xarray, plan = pytest.importorskip("xarray"), store.load(path).plan
+    xarray, plan = pytest.importorskip("xarray"), run_file.load(path).plan
     with xarray.open_datatree(path, engine="h5netcdf") as tree:
         calibration = tree["calibrate/calibration"]
         assert calibration["P"].dims == ("view", "image_row", "coordinate")
@@ -131,7 +131,7 @@ def test_the_checksum_is_that_of_the_data_and_every_array_has_one_of_its_own(pat
 
 
 def test_same_records_make_the_same_bytes(path):
-    store.save(dataclasses.replace(store.load(path), path=path.parent / "other.h5"))
+    run_file.save(dataclasses.replace(run_file.load(path), path=path.parent / "other.h5"))
     assert path.read_bytes() == (path.parent / "other.h5").read_bytes()
 
 
@@ -139,19 +139,19 @@ def test_what_is_added_to_and_what_is_written_as_a_whole_hold_the_same(tmp_path,
     made = sound_run(tmp_path / "run.h5").results
     stored = []
     monkeypatch.setattr(
-        store, "save_record", lambda group, record: stored.append(group.name) or save_record(group, record)
+        run_file, "save_record", lambda group, record: stored.append(group.name) or save_record(group, record)
     )
-    run = store.Run(tmp_path / "run.h5")
+    run = run_file.Run(tmp_path / "run.h5")
     for name in made:
-        run = store.save(dataclasses.replace(run, results={**run.results, name: made[name]}))
+        run = run_file.save(dataclasses.replace(run, results={**run.results, name: made[name]}))
     assert len(stored) == len(set(stored)) == 7  # each record once
     for refuted in ("a camera moved", ""):  # said, and taken back
-        run = store.save(dataclasses.replace(run, refuted=refuted))
-        assert store.load(run.path).refuted == refuted
+        run = run_file.save(dataclasses.replace(run, refuted=refuted))
+        assert run_file.load(run.path).refuted == refuted
     replaced = {**made, "plan": result(**{"": fake(Plan, 8)})}
     for results in (made, replaced):
-        run = store.save(dataclasses.replace(run, results=results))
-        back = store.load(run.path).results
+        run = run_file.save(dataclasses.replace(run, results=results))
+        back = run_file.load(run.path).results
         assert list(back) == list(results)
         for name, one in results.items():
             for label, record in one.records.items():
@@ -159,10 +159,10 @@ def test_what_is_added_to_and_what_is_written_as_a_whole_hold_the_same(tmp_path,
 
 
 def test_a_failing_save_leaves_the_old_file_and_no_debris(path, monkeypatch):
-    run = store.load(path)
+    run = run_file.load(path)
     monkeypatch.setattr(Path, "replace", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left")))
     with pytest.raises(InputError, match="No space left"):
-        store.save(run)
+        run_file.save(run)
     assert path.read_bytes() == sound_file()
     assert [found.name for found in path.parent.iterdir()] == ["run.h5"]
 

@@ -16,8 +16,8 @@ from projservo_cli import cli
 from projservo_cli.config import load_config, load_sweep
 from projservo_cli.config.schema import starter
 from projservo_cli.records import InputError
-from projservo_cli.store import load
 from projservo_cli.store.observation_tables import read_joint_list, read_table
+from projservo_cli.store.run_file import load
 from tests.conftest import ROOT
 from tests.survival.changes import CSV, YAML, Change
 

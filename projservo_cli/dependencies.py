@@ -26,7 +26,7 @@ from projservo_cli.report.report_data import CLAIMS_FILE, PAGE_FILE
 from projservo_cli.result_hashes import key_of
 from projservo_cli.robots.source import source_hash
 from projservo_cli.settings.task import TaskStep
-from projservo_cli.store import SERVO, Result, Run
+from projservo_cli.store.run_file import SERVO, Result, Run
 
 # The stages in their order, and what makes the record that each is given.
 _INPUTS: dict[str, Callable[[Config, Files | None], Any]] = {
