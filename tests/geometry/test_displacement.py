@@ -7,13 +7,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
 
 from projservo_cli.geometry.algebra import as_array, mat
 from projservo_cli.geometry.displacements import (
+    aligned,
     cross_matrix,
     exp_rotation,
     normalize_displacement,
     rigid_inverse,
+    rotation_and_inverse,
     screw_displacements,
     screws,
     translation,
@@ -35,6 +38,8 @@ def test_rotation_is_the_matrix_exponential(theta, seed):
     H_hat = conjugate(revolute([0.3, -0.2, 1.5], [1, 2, -3]), seed)
     # Round-off of entries of size 10 through the powers of the series.
     assert exp_rotation(H_hat, theta) == pytest.approx(expm(theta * H_hat), abs=2e-12)
+    for H, angle in zip(rotation_and_inverse(mat(H_hat), theta), (theta, -theta), strict=True):
+        assert as_array(H) == pytest.approx(expm(angle * H_hat), abs=2e-12)
 
 
 @given(st.floats(-3.0, 3.0), st.integers(0, 100))
@@ -61,6 +66,20 @@ def test_exponentials_of_screws_are_rigid_and_those_of_scipy(rng):
     np.testing.assert_allclose(T, [expm(x * H) for x, H in zip(q, twists(axes), strict=True)], atol=1e-12)
     np.testing.assert_allclose(T @ rigid_inverse(T), np.broadcast_to(np.eye(4), T.shape), atol=1e-12)
     np.testing.assert_allclose(screws(twists(axes)), axes, atol=1e-15)
+
+
+@given(st.integers(0, 10**6), st.integers(3, 8))
+def test_alignment_of_weighted_points_is_that_of_scipy(seed, m):
+    rng = np.random.default_rng(seed)
+    body, points, weight = (rng.standard_normal(shape) for shape in ((m, 3), (2, m, 3), (2, m)))
+    weight = np.exp(weight)
+    for k, (R, t) in enumerate(zip(*aligned(body, points, weight), strict=True)):
+        centers = [np.average(each, axis=0, weights=weight[k]) for each in (points[k], body)]
+        wanted, _ = Rotation.align_vectors(points[k] - centers[0], body - centers[1], weight[k])
+        residuals = [(points[k] - centers[0] - (body - centers[1]) @ S.T) for S in (R, wanted.as_matrix())]
+        least = [float(np.sum(weight[k][:, None] * r**2)) for r in residuals]
+        assert least[0] == pytest.approx(least[1], rel=1e-9)
+        np.testing.assert_allclose(R @ centers[1] + t, centers[0], atol=1e-12)
 
 
 def test_scale_of_a_homography_keeps_points_on_their_side_of_infinity():
