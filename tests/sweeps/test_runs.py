@@ -20,7 +20,16 @@ CASES = {
         "runs": 2,
         "random": {"control.gain_s": {"uniform": [1, 3]}},
     },
-    "late images": {"set": {"disturbance.camera_latency_s": 0.08, "stop.max_steps": 20}, "runs": 1},
+    "late images": {
+        "set": {
+            "disturbance.camera_latency_s": 0.08,
+            "stop.max_steps": 20,
+            "calibration.frames_per_joint": 3,
+            "calibration.random_poses": 6,
+        },
+        "grid": {"law": ["direct_two"]},
+        "runs": 1,
+    },
     "constrained": {"set": {"trajectory.profile": "constrained"}, "runs": 1, "between_samples": True},
     "python loop": {"set": {"plant.speed_scale": 0.5, "stop.max_steps": 10}, "runs": 1},
     "half turn": {"base": "paper", "runs": 2, "set": {"noise.calibration_px": 0.5}},
