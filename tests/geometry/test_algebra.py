@@ -59,7 +59,7 @@ def test_unit_vectors():
     assert unit((0.0, 0.0, 0.0, 0.0)) == (0.0, 0.0, 0.0, 0.0)
 
 
-@settings(max_examples=200)
+@settings(max_examples=80)
 @given(vectors, vectors, vectors, vectors)
 def test_meet_is_the_determinant_with_one_row_open(a, b, c, x):
     """x·meet(a, b, c) = det[x; a; b; c]: incidence with all three, and the sign of an orientation."""
@@ -68,7 +68,7 @@ def test_meet_is_the_determinant_with_one_row_open(a, b, c, x):
     assert abs(dot(meet(a, b, c), x) - wanted) <= 32 * EPS * max(size, 1e-30)
 
 
-@settings(max_examples=300)
+@settings(max_examples=120)
 @given(vectors, vectors, st.integers(-13, 0))
 def test_dual_pencil_is_orthonormal_and_incident(A, D, exponent):
     """Two orthonormal planes through A and A + D, also where D is thirteen orders smaller than A."""

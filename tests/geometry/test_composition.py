@@ -15,7 +15,7 @@ from tests.samples import frame, revolute
 angles = st.one_of(st.sampled_from([0.0, math.pi]), st.floats(-2 * math.pi, 2 * math.pi))
 
 
-@settings(max_examples=300)
+@settings(max_examples=100)
 @given(st.floats(-2, 2), st.floats(-2, 2), st.floats(-2, 2))
 def test_solutions_are_all_zeros_of_the_equation(p_0, p_s, p_c):
     amplitude = math.hypot(p_s, p_c)

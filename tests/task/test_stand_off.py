@@ -25,12 +25,12 @@ def displaced(model, M, q, asked, G, metre=1.0):
 @pytest.mark.parametrize("kind", ALONG)
 @pytest.mark.parametrize("amount", [{"by_m": 0.05}, {"by_m": -0.02}, {"by_px": 30.0}, {"by_px": -7.0}])
 def test_a_displaced_goal_is_as_far_as_asked_for_in_any_frame(kind, amount):
-    for seed in range(20):
+    for seed in range(5):
         generator = np.random.default_rng(seed)
         model, M = random_arm(generator)
         q = model.q_reference + deviating(generator)
         asked = StandOff("pin", ALONG[kind], **({"by_m": None, "by_px": None} | amount))
-        frames = [np.eye(4), frame(seed), frame(seed + 99)]
+        frames = [np.eye(4), frame(seed)]
         units = [_unit(model, M, q, G) for G in frames]
         each = [displaced(model, M, q, asked, G, u) for G, u in zip(frames, units, strict=True)]
         each = [back / back[3, 3] for back in each]
