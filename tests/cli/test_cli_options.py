@@ -92,7 +92,6 @@ def test_a_shell_completes_commands_stages_laws_and_files(line, offered, monkeyp
 RECORDED, TINY = ["calibrate", "--data", "t.csv"], ["calibrate", "-c", "tiny.yaml"]
 USAGE = {
     "unknown command": (["calibrat"], "did you mean calibrate?"),
-    "unknown option": (["calibrate", "--nose-px", "1"], "--nose-px"),
     "only options": (["--json"], "no command"),
     "law of a stage without laws": (["calibrate", "--law", "stacked"], "--law: not used by calibrate"),
     "unknown law": (["servo", "--law", "direct_four"], "laws: direct_three, direct_two, stacked"),
@@ -114,7 +113,6 @@ USAGE = {
         "--data and --metric: validate takes one of them",
     ),
     "fit of no positions": (["validate", "out", "--fit", "t.csv"], "are for --metric, which is not given"),
-    "threads": (["servo", "-j", "0"], "-j"),
     "image size without height": (
         ["calibrate", "--data", "t.csv", "--image-size", "1280"],
         "--image-size 1280: expected width x height in px, such as 1280x1024",
