@@ -108,8 +108,10 @@ def test_writing_and_reading_is_exact(tmp_path_factory, data):
             np.isnan(images[..., 0]), np.nan, data.draw(st.floats(1e-3, 1e3)) + rng.random(shape)
         )
     if data.draw(st.booleans()):
-        more = more | {"moving": rng.integers(0, 3, len(poses)), "t_q": rng.random(len(poses))}
-        more["t_view"] = np.where(rng.random(shape[:2]) < 0.2, np.nan, rng.random(shape[:2]))
+        t_q = 0.03 * np.arange(len(poses)) + 0.01 * rng.random(len(poses))
+        t_view = t_q[:, None] + 0.01 * rng.random(shape[:2])
+        t_view[rng.random(shape[:2]) < 0.2] = np.nan
+        more = more | {"moving": rng.integers(0, 3, len(poses)), "t_q": t_q, "t_view": t_view}
         more["moving"][-1], more["t_view"][0, 0] = 1, 0.5  # what is nowhere is no column
     table = Observation(np.array(poses), np.array(markers), q, images, view=views, **more)
     path = tmp_path_factory.mktemp("tables") / "table.csv"
