@@ -48,15 +48,12 @@ def test_products_agree_with_numpy(rng):
     assert inner(A_v, B_v) == pytest.approx(np.sum(A * B), abs=1e-14)
     assert dot(x_v, y_v) == pytest.approx(x @ y, abs=1e-15)
     assert axpy(2.0, x_v, y_v) == pytest.approx(2 * x + y, abs=1e-15)
+    assert unit((0.0, 3.0, 0.0, -4.0)) == pytest.approx((0.0, 0.6, 0.0, -0.8))
+    assert unit((0.0, 0.0, 0.0, 0.0)) == (0.0, 0.0, 0.0, 0.0)
     mat_into(B, A_v)
     vec_into(y, vec(x))
     assert np.array_equal(A, B)
     assert np.array_equal(x, y)
-
-
-def test_unit_vectors():
-    assert unit((0.0, 3.0, 0.0, -4.0)) == pytest.approx((0.0, 0.6, 0.0, -0.8))
-    assert unit((0.0, 0.0, 0.0, 0.0)) == (0.0, 0.0, 0.0, 0.0)
 
 
 @settings(max_examples=80)

@@ -217,27 +217,25 @@ def test_held_joints_stand_still_and_the_run_goes_on_as_it_would_have():
     np.testing.assert_array_equal(np.delete(held.log.q, range(5, 9), axis=0), whole.log.q[:-4])
 
 
-class Noted(AnalyticPlant):
-    """Notes what it is sent."""
+class Bumped(AnalyticPlant):
+    """Tells of a disturbance at an observation, and notes what it is sent."""
 
-    def __init__(self, sc, steps=200, takes_parts=False, bumped=None):
-        super().__init__(sc.plant, sc.q_start, np.zeros((steps + 1, 2, 4, 2)))
-        self.takes_parts, self.bumped = takes_parts, bumped
-        self.sent = []
+    at, sent = 0, ()
 
     def observe(self):
         s = super().observe()
-        self.disturbance = "bumped" if self.observations - 1 == self.bumped else ""
+        self.disturbance = "bumped" if self.observations - 1 == self.at else ""
         return s
 
     def command(self, step, period):
-        self.sent.append((step, period))
+        self.sent += (step,)
         super().command(step, period)
 
 
 def test_a_disturbance_ends_the_run_before_any_other_verdict():
-    sc = scene()
-    for bumped, verdict in ((7, "converged"), (0, "fault detected")):
-        plant, ends = Noted(sc, bumped=bumped), limits(max_steps=199, image_error_px=1e9)
+    sc, ends = scene(), limits(max_steps=199, image_error_px=1e9)
+    for at, verdict in ((7, "converged"), (0, "fault detected")):
+        plant = Bumped(sc.plant, sc.q_start, np.zeros((200, 2, 4, 2)))
+        plant.at = at
         code, steps, _ = run_in_python(Towards(sc.q_goal), plant, sc.s_star, 0.04, ends)
-        assert (VERDICTS[code], steps, plant.sent) == (verdict, 0, [])
+        assert (VERDICTS[code], steps, plant.sent) == (verdict, 0, ())

@@ -47,18 +47,15 @@ def goal_of(arm, H=AT_GOAL):
     return Look(pixels(arm.cameras, arm.markers @ H.T))
 
 
-def length_of(arm):
-    return np.linalg.norm(arm.markers[1] - arm.markers[0]), (0, 10)
-
-
 @pytest.mark.parametrize(("seed", "types", "views"), [(None, "RRRRRR", 2), (1, "RPRR", 3), (3, "RR", 2)])
 def test_exact_images_give_the_exact_goal(seed, types, views, rng):
     arm, G = random_robot(types, rng, views=views), np.eye(4) if seed is None else frame(seed)
     c = calibrated(arm, G)
     c = dataclasses.replace(c, view=("left", "right", "top")[:views])
+    length = np.linalg.norm(arm.markers[1] - arm.markers[0])
     seen = looks(arm, displacement([0, 0, 0.1], [0.01, 0, 0]), MOVED)
     seen[0].s[0, 1] = seen[2].s[1, 6] = math.nan  # one that two views see but at the second look, and one now
-    found = DisplacedObject.of(c, NUMBERS, seen, c.metric(*length_of(arm)))
+    found = DisplacedObject.of(c, NUMBERS, seen, c.metric(length, (0, 10)))
     back = np.linalg.inv(G)
     assert pytest.approx(G @ MOVED @ back, abs=1e-9) == found.D
     M = OBJECT @ G.T
