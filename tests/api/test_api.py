@@ -5,6 +5,7 @@ import importlib
 import json
 import os
 import pkgutil
+import shutil
 import subprocess
 import sys
 
@@ -14,13 +15,12 @@ import pytest
 import projservo_cli as ps
 from projservo_cli import cli
 from projservo_cli.calibration import prediction_variance
+from projservo_cli.planning import shown_joints
 from projservo_cli.records import Calibration, Observation, Trace
 from projservo_cli.store.observation_tables import read_table, write_table
 from tests.configured import calibrate
 from tests.conftest import ROOT
 
-CONFIGS = ("apart", "coupled", "hobby", "stanford")
-LATE = {"disturbance.camera_latency_s": 0.1, "disturbance.servo_time_constant_s": 0.05}
 FEW = {"calibration.frames_per_joint": 3, "calibration.random_poses": 6}
 
 
@@ -51,6 +51,12 @@ def made(config):
     return observations, calibration, ps.plan(config, calibration)
 
 
+@pytest.fixture
+def begun(calibrated_run, tmp_path):
+    """Folder of a run with its calibration, which may be gone on with."""
+    return shutil.copytree(calibrated_run("ur5"), tmp_path / "run")
+
+
 def alike(first, second, kind):
     """Whether records are equal to the bit but for the time they took."""
     for one in dataclasses.fields(kind):
@@ -59,7 +65,7 @@ def alike(first, second, kind):
             np.testing.assert_array_equal(np.array(a), np.array(b), err_msg=one.name)
 
 
-@pytest.mark.parametrize("name", CONFIGS)
+@pytest.mark.parametrize("name", ["hobby", "stanford"])
 def test_a_calibration_from_python_is_that_of_the_chain(name):
     config = ps.Config.load(name).replace(FEW)
     seen, chained, _ = calibrate.run(config)
@@ -68,16 +74,15 @@ def test_a_calibration_from_python_is_that_of_the_chain(name):
     alike(ps.calibrate(observations, lens=config.calibration.lens), chained, Calibration)
 
 
-def test_a_score_is_that_of_validate(config, made, tmp_path, capsys):
+def test_a_score_is_that_of_validate(config, made, begun, tmp_path, capsys):
     observations, calibration, _ = made
     held_out = ps.simulate(config, observations.q[:9] + 0.05)
     write_table(held_out, tmp_path / "held.csv")
-    run = ps.Experiment(config, tmp_path / "run").make("calibrate")
-    assert cli.run(["validate", str(tmp_path / "run"), "--data", str(tmp_path / "held.csv"), "--json"]) == 0
+    assert cli.run(["validate", str(begun), "--data", str(tmp_path / "held.csv"), "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert calibration.score(held_out) == {key: value for key, value in told.items() if key != "run"}
     table = ps.Observations.from_frame(str(tmp_path / "held.csv"))
-    assert calibration.score(table) == run.calibration.score(held_out)
+    assert calibration.score(table) == ps.load(begun).calibration.score(held_out)
 
 
 def test_deviations_are_those_of_the_covariance(made):
@@ -136,20 +141,17 @@ def test_a_run_has_the_start_and_goal_of_its_plan(config, made):
         ps.servo(config, calibration, other)
 
 
-@pytest.mark.parametrize(
-    ("changed", "what"),
-    [
-        (lambda s: s + np.array([[[0.0, 20.0]], [[0.0, 0.0]]]), "leaves .* px rms a marker"),
-        (lambda s: s + 15.0 * (np.arange(16).reshape(2, 4, 2) == 4), "marker 2 is .* px off in the left one"),
-    ],
-    ids=["shifted", "one marker"],
-)
-def test_goal_images_without_joints_must_fit_the_calibration(config, made, changed, what):
+def test_goal_images_without_joints_must_fit_the_calibration(config, made, monkeypatch):
+    monkeypatch.setattr(shown_joints, "_TRIALS", 5)  # else seconds until images that fit nowhere are given up
     _, calibration, plan = made
     images = calibration.predict(plan.q_start + 0.1)[:, calibration.indices_of(config.face_numbers)]
     assert ps.plan(config, calibration, goal=images).feasible
-    with pytest.raises(ps.WorkFailed, match=what):
-        ps.plan(config, calibration, goal=changed(images))
+    for off, what in (
+        (np.array([[[0.0, 20.0]], [[0.0, 0.0]]]), "leaves .* px rms a marker"),
+        (15.0 * (np.arange(16).reshape(2, 4, 2) == 4), "marker 2 is .* px off in the left one"),
+    ):
+        with pytest.raises(ps.WorkFailed, match=what):
+            ps.plan(config, calibration, goal=images + off)
 
 
 def test_a_trace_is_that_of_the_chain_and_of_a_class_like_that_of_its_name(config, made):
@@ -271,7 +273,7 @@ class Law:
         return 0.0 * q
 
 if __name__ == "__main__":
-    study = ps.sweep(ps.Config.load("ur5"), laws=[Law], runs=2, workers=2)
+    study = ps.sweep(ps.Config.load("ur5"), laws=[Law], runs=1, workers=2)
     print(study.table["verdict"].tolist())
 """
 
@@ -285,31 +287,31 @@ def test_a_script_is_told_of_the_guard_it_lacks_and_its_classes_work_with_one(tm
     study.write_text(SCRIPT, encoding="utf-8")
     command, environment = [sys.executable, "study.py"], {**os.environ, "PYTHONPATH": str(ROOT)}
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
-    assert done.stdout == "['no progress', 'no progress']\n", done.stderr
+    assert done.stdout == "['no progress']\n", done.stderr
 
 
-def test_an_experiment_is_made_once_resumed_and_opened_again(config, tmp_path):
-    run = ps.Experiment(config, tmp_path / "run").make("plan")
+def test_an_experiment_is_made_once_resumed_and_opened_again(config, begun):
+    run = ps.Experiment(config, begun).make("plan")
     keys = {name: result.key for name, result in run.results.items()}
-    again = ps.Experiment(config, tmp_path / "run").make("servo")
+    again = ps.Experiment(config, begun).make("servo")
     assert {name: again.results[name].key for name in keys} == keys
     np.testing.assert_array_equal(again.calibration.P, run.calibration.P)
-    assert ps.load(tmp_path / "run").traces["exact"].verdict == "converged"
+    assert ps.load(begun).traces["exact"].verdict == "converged"
 
 
-def test_a_law_of_a_notebook_is_never_up_to_date(config, tmp_path, monkeypatch):
+def test_a_law_of_a_notebook_is_never_up_to_date(config, begun, monkeypatch):
     monkeypatch.setattr(sys.modules["__main__"], "Resolved", Resolved, raising=False)
-    run = ps.Experiment(config, tmp_path / "run").make("servo", laws=["__main__:Resolved"])
+    run = ps.Experiment(config, begun).make("servo", laws=["__main__:Resolved"])
     monkeypatch.setattr(Resolved, "gain", 1.0)
     steps = run.traces["__main__:Resolved"].steps
     assert run.make("servo", laws=["__main__:Resolved"]).traces["__main__:Resolved"].steps > 1.5 * steps
 
 
-def test_a_stored_run_starts_no_code_that_it_names(config, tmp_path):
+def test_a_stored_run_starts_no_code_that_it_names(config, begun):
     named = config.replace({"control.laws": [f"{__name__}:Resolved"]})
-    ps.Experiment(named, tmp_path / "run").make("plan")
+    ps.Experiment(named, begun).make("plan")
     with pytest.raises(ps.InputError, match="is named by the stored run alone, which starts no code"):
-        ps.load(tmp_path / "run").make("servo")
+        ps.load(begun).make("servo")
 
 
 def arrays(**given):
@@ -330,7 +332,6 @@ REFUSED = [
     (lambda c, k, p: ps.simulate(c, np.full((1, 6), 7.0)), "q: pose 0: joint 1 would be at 7 rad, beyond"),
     (lambda c, k, p: ps.simulate(c, np.full((1, 6), 90.0)), "joint 1 at 90 is more than two turns in rad"),
     (lambda c, k, p: ps.simulate(c, "here"), r"q: no array of numbers; expected shape \(K, 6\), rad or m"),
-    (lambda c, k, p: ps.simulate(c, seed=-1), "calibration.seed: must be at least 0"),
     (lambda c, k, p: ps.simulate("ur5"), "simulate: config of type str: read one with Config.load"),
     (lambda c, k, p: ps.calibrate(np.zeros(3)), "observations of type ndarray; make them with"),
     (lambda c, k, p: ps.calibrate(ps.simulate(c), method="best"), "method: 'best' is not one of them"),
@@ -342,16 +343,10 @@ REFUSED = [
     (lambda c, k, p: ps.sweep(c, laws=["exact"], runs=0), "^sweep: runs: must be at least 1, not 0$"),
     (lambda c, k, p: ps.sweep(c, laws=[]), "sweep: name one law or more"),
     (lambda c, k, p: ps.sweep(c, laws="exact"), r"sweep: laws 'exact': give a list of them, such as laws=\["),
-    (
-        lambda c, k, p: ps.sweep(c, laws=[3]),
-        "law 3: expected a name, or a class or function that makes a law",
-    ),
     (lambda c, k, p: ps.sweep(c, laws=[Resolved, Resolved]), "grid.law: a value stands there twice"),
-    (lambda c, k, p: ps.sweep(c, laws=["best"]), "law best: no such law; laws: direct_three"),
     (lambda c, k, p: ps.plan(c, k, q_start=np.degrees(p.q_start)), "q_start: .* two turns in rad"),
     (lambda c, k, p: ps.plan(c, k, q_start=[1, 2]), r"q_start of shape \(2,\): expected \(6,\)"),
     (lambda c, k, p: ps.plan(c, k, goal=np.zeros((2, 3, 2))), r"\(6,\) joint readings, or \(2, 4, 2\)"),
-    (lambda c, k, p: ps.plan(c, k, goal=[[1, 2], [3]]), r"goal: no array of numbers; .* \(2, 4, 2\)"),
     (lambda c, k, p: ps.plan(ps.Config.load("stanford"), k), "the configuration of RRPRRR: take one"),
     (lambda c, k, p: ps.servo(c, k, p.q), "servo: plan of type ndarray: make one with plan"),
     (lambda c, k, p: ps.servo(c, k, p, law="exakt"), "law exakt: no such law; laws: direct_three"),
@@ -362,14 +357,9 @@ REFUSED = [
         "^control.mode track: stacked has no such mode, only regulate and image_track; laws that have",
     ),
     (
-        lambda c, k, p: ps.servo(c, k, p, law=Resolved, mode="track"),
-        r"^control.mode track: .*:Resolved has no such mode, only regulate; ",
-    ),
-    (
         lambda c, k, p: ps.servo(c, k, p, law="exact_track", mode="regulate"),
         "^servo: law exact_track is exact in mode track, not 'regulate': leave mode out$",
     ),
-    (lambda c, k, p: k.predict("here"), r"joint readings: no array of numbers; expected shape \(6,\) or"),
     (lambda c, k, p: k.predict(np.full(6, 90.0)), "joint readings: joint 1 at 90 is more than two turns"),
     (lambda c, k, p: k.project("here"), r"points: no array of numbers; expected shape \(..., 4\)"),
     (lambda c, k, p: k.score({"q1": [0.0]}), "score: observations of type dict; make them with"),
@@ -383,13 +373,7 @@ REFUSED = [
     (lambda c, k, p: arrays(**MIXED), r"q3 of pose 0 is 150\.5, of a prismatic .*they look like millimetres"),
     (lambda c, k, p: arrays(joint_unit="degrees"), "q: joint_unit 'degrees': give deg or rad"),
     (lambda c, k, p: arrays(joint_types="RRR"), "joint_types: 'RRR': expected 6 letters R or P"),
-    (lambda c, k, p: arrays(joint_types=6), "joint_types: 6: expected 6 letters R or P"),
-    (
-        lambda c, k, p: arrays(image_size=(1280,)),
-        r"image size \(1280,\): give a positive width and height, px",
-    ),
     (lambda c, k, p: arrays(image_size="1280x1024"), "image size '1280x1024': give a positive width and"),
-    (lambda c, k, p: arrays(noise_px=0), "pixel noise 0: give a positive number, or none to estimate it"),
     (lambda c, k, p: arrays(noise_px=float("nan")), "pixel noise nan: give a positive number"),
     (lambda c, k, p: arrays(noise_px="a"), "pixel noise 'a': give a positive number"),
     (lambda c, k, p: arrays(marker=[1, 1, 2]), "marker: expected 3 different whole numbers"),
@@ -447,10 +431,10 @@ def test_what_is_masked_is_unseen(made):
     np.testing.assert_array_equal(metric.triangulate(masked(seen)), metric.triangulate(seen))
 
 
-def test_labelled_arrays_are_the_group_of_the_run_file(config, made, tmp_path):
+def test_labelled_arrays_are_the_group_of_the_run_file(config, made, begun):
     xarray = pytest.importorskip("xarray")
-    run = ps.Experiment(config, tmp_path / "run").make("servo")
-    stored = xarray.load_dataset(tmp_path / "run" / "run.h5", engine="h5netcdf", group="servo/exact")
+    run = ps.Experiment(config, begun).make("servo")
+    stored = xarray.load_dataset(begun / "run.h5", engine="h5netcdf", group="servo/exact")
     labelled = run.traces["exact"].to_xarray()
     coordinates = {"joint", "marker", "view", "xy"}
     xarray.testing.assert_equal(labelled.drop_vars(coordinates), stored)

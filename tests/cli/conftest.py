@@ -51,7 +51,6 @@ class Stages:
     made: list[str] = field(default_factory=list)
     fails: dict[str, Exception] = field(default_factory=dict)
     verdicts: dict[str, str] = field(default_factory=dict)
-    reported: list[tuple[list[str], str]] = field(default_factory=list)
     gone: bool = False
 
     def _make(self, name: str) -> None:
@@ -94,7 +93,6 @@ class Stages:
 
     def report(self, inputs: Any, run: Any, directory: Any, *, progress: Any) -> Any:
         self._make("report")
-        self.reported.append((list(run.traces), run.configuration))
         claim = {"claim": "c", "source": "s", "measured": "3 mm", "criterion": "< 4 mm", "holds": True}
         left_out = {"what": "fig_9", "reason": "no run"}
         claims = (claim, {**claim, "claim": "it is large", "measured": "1 mm", "holds": False})

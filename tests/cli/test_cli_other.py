@@ -59,12 +59,20 @@ def test_show_tells_what_a_run_holds(projservo, reported, tmp_path):
 CONSEQUENCES = {"21", "22", "§2"}
 
 
+@pytest.fixture(scope="module")
+def called():
+    """Names that the package calls, beside where they are defined."""
+    lines = (path.read_text(encoding="utf-8") for path in (ROOT / "projservo_cli").rglob("*.py"))
+    return set(re.findall(r"(?<!def )\b(\w+)\(", "\n".join(lines)))
+
+
 @pytest.mark.parametrize("entry", REGISTER, ids=lambda entry: entry.number)
-def test_the_register_names_tests_and_functions_that_are_there_and_name_the_equation(entry):
+def test_the_register_names_tests_and_functions_that_are_there_and_name_the_equation(entry, called):
     assert entry.functions
     named = set()
     for dotted in entry.functions:
         module, name = dotted.rsplit(".", 1)
+        assert name in called, dotted
         words = getattr(importlib.import_module(module), name).__doc__
         named |= set(re.findall(r"\(([0-9]+)\)", words)) | set(re.findall(r"section ([0-9.]+[0-9])", words))
         for first, last in re.findall(r"\(([0-9]+)\)–\(([0-9]+)\)", words):

@@ -49,7 +49,6 @@ def test_up_to_date_is_skipped_and_prints_the_same(projservo, stages):
         ("control.gain_t=1", ALL[2:]),
         ("control.laws=[stacked]", ["report"]),
         ("control.mode=[regulate, image_track]", ["stacked_image_track", "report"]),
-        ("report.formats=[png]", ["report"]),
         ("noise.servo_px=0.1", ALL[1:]),
     ],
 )
@@ -151,9 +150,7 @@ OWN = "tests.cli.conftest:Law"
         ("exact", (), 1),
         ("exact", ("control.mode=track",), 1),
         (OWN, (), 1),
-        ("direct_two", (), 1),
         ("stacked", (), 0),
-        ("exact", ("control.must_converge=[direct_three]",), 0),
         (OWN, ("control.must_converge=[]",), 0),
         ("stacked", ("control.must_converge=[stacked]",), 1),
     ],

@@ -2,7 +2,6 @@
 
 import math
 import pickle
-from functools import cache
 
 import numpy as np
 
@@ -16,25 +15,23 @@ from tests.scene import GAINS, Run, limits
 SPEED = math.radians(30.0)
 
 
-def planned(*given, **named):
-    """Plan of a scene, made once for equal arguments, since it takes seconds without the compiler; a copy."""
-    return pickle.loads(_pickled_plan(pickle.dumps((given, named))))
+_PLANS: dict[bytes, bytes] = {}
 
 
-@cache
-def _pickled_plan(arguments):
-    given, named = pickle.loads(arguments)
-    return pickle.dumps(_planned(*given, **named))
+def planned(sc, G=None, profile="linear", duration=None, speed=SPEED, ramp=0.0):
+    """Plan of a scene in the frame of its model, at a joint-speed limit.
 
-
-def _planned(sc, G=None, profile="linear", duration=None, speed=SPEED, ramp=0.0):
-    """Plan of a scene in the frame of its model, at a joint-speed limit."""
-    model = sc.seen(G)
-    n = len(sc.q_start)
-    demands = limits_alone(JointLimits(np.full(n, -9.0), np.full(n, 9.0), *np.full((2, n), speed)))
-    shown = TaskImages(sc.q_start, sc.s_start, sc.s_star, sc.plant.center)
-    motion = asked(profile, duration=duration, ramp=ramp)
-    return plan_task(model._replace(lens=no_lenses(2)), shown, motion, demands)
+    It is made once for equal arguments, since it takes seconds without the compiler; this is a copy.
+    """
+    key = pickle.dumps((sc, G, profile, duration, speed, ramp))
+    if key not in _PLANS:
+        n = len(sc.q_start)
+        demands = limits_alone(JointLimits(np.full(n, -9.0), np.full(n, 9.0), *np.full((2, n), speed)))
+        shown = TaskImages(sc.q_start, sc.s_start, sc.s_star, sc.plant.center)
+        motion = asked(profile, duration=duration, ramp=ramp)
+        plan = plan_task(sc.seen(G)._replace(lens=no_lenses(2)), shown, motion, demands)
+        _PLANS[key] = pickle.dumps(plan)
+    return pickle.loads(_PLANS[key])
 
 
 def tracked(sc, G=None, plan=None, rate=1.0, task=None):

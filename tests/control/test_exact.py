@@ -29,10 +29,9 @@ def test_the_centre_keeps_to_its_line(arm, gain, limit):
     assert trace.center_deviation_mm < 0.2
 
 
-@pytest.mark.parametrize("scale", [0.05, 0.5])
-def test_a_scaled_command_keeps_to_the_line(scale):
+def test_a_scaled_command_keeps_to_the_line():
     # Long steps, which a straight way between the joints of their ends would leave by millimetres.
-    trace = exact_run("paper", 0.5, "null", f"plant.speed_scale={scale}", "stop.max_steps=40")
+    trace = exact_run("paper", 0.5, "null", "plant.speed_scale=0.5", "stop.max_steps=15")
     assert trace.center_deviation_at_samples_mm < 1e-7
     assert np.abs(trace.q[1] - trace.q[0]).max() > 0.04
 

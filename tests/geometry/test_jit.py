@@ -20,28 +20,29 @@ from tests.conftest import INTERPRETED
 PACKAGE = Path(projservo_cli.__file__).parent
 
 
-@pytest.fixture
-def copy(tmp_path):
-    """Copy of the package whose sources may be edited."""
-    root = tmp_path / "package"
-    shutil.copytree(PACKAGE, root, ignore=shutil.ignore_patterns("__pycache__"))
-    return root
-
-
-@pytest.mark.parametrize("name", ["records.py", "geometry/stereo.py"])
-def test_an_edited_helper_or_a_new_kernel_makes_another_cache(copy, name, tmp_path, monkeypatch):
+def test_an_edited_helper_or_a_new_kernel_makes_another_cache(tmp_path, monkeypatch):
+    copy = tmp_path / "package"
+    shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
     monkeypatch.setenv("PROJSERVO_CACHE_DIR", str(tmp_path / "cache"))
-    before = cache_folder(copy)
-    assert before.parent == tmp_path / "cache" / "projservo"
-    assert before.is_dir()
-    assert before == cache_folder(copy) == cache_folder(PACKAGE)
-    file = copy / name
-    file.write_text(file.read_text(encoding="utf-8") + "\n# edited\n", encoding="utf-8")
-    edited = cache_folder(copy)
-    (copy / "cli" / "new.py").write_text("", encoding="utf-8")
-    assert cache_folder(copy) == edited != before
-    (copy / "cli" / "new.py").write_text("@njit\ndef f(x):\n    return x\n", encoding="utf-8")
-    assert cache_folder(copy) not in (before, edited)
+    found = [cache_folder(copy)]
+    assert found[0].parent == tmp_path / "cache" / "projservo"
+    assert found[0].is_dir()
+    assert found[0] == cache_folder(copy) == cache_folder(PACKAGE)
+    new = "cli/new.py"
+    for name, text in (
+        ("records.py", "# 1\n"),
+        ("geometry/stereo.py", "# 2\n"),
+        (new, "@njit\ndef f(x): ...\n"),
+    ):
+        (copy / new).touch()
+        assert cache_folder(copy) == found[-1]
+        with (copy / name).open("a", encoding="utf-8") as file:
+            file.write(text)
+        found.append(cache_folder(copy))
+    assert len(set(found)) == 4
+    (tmp_path / "occupied").write_text("a file, not a folder", encoding="utf-8")
+    monkeypatch.setenv("PROJSERVO_CACHE_DIR", str(tmp_path / "occupied"))
+    assert cache_folder(copy) is None
 
 
 @pytest.mark.skipif(INTERPRETED, reason="nothing is compiled: NUMBA_DISABLE_JIT is set")
@@ -66,12 +67,6 @@ def test_what_a_compiled_function_calls_lies_in_a_hashed_source():
             if home.startswith("projservo_cli"):
                 path = home.removeprefix("projservo_cli.").replace(".", "/")
                 assert {f"{path}.py", f"{path}/__init__.py"} & hashed, (function, value)
-
-
-def test_no_cache_where_nothing_can_be_written(copy, tmp_path, monkeypatch):
-    (tmp_path / "occupied").write_text("a file, not a folder", encoding="utf-8")
-    monkeypatch.setenv("PROJSERVO_CACHE_DIR", str(tmp_path / "occupied"))
-    assert cache_folder(copy) is None
 
 
 def after(x):

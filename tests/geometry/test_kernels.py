@@ -49,7 +49,7 @@ def test_kernel_of_an_exactly_singular_matrix(rng, m, n):
 
 
 @pytest.mark.parametrize("n", [5, 6, 7])
-@pytest.mark.parametrize("noise", [1e-16, 1e-14, 1e-13, 1e-10, 1e-6, 1e-3, 1e-2, 2e-2])
+@pytest.mark.parametrize("noise", [1e-16, 1e-13, 1e-6, 2e-2])
 def test_noisy_kernel_is_the_least_right_singular_vector(rng, n, noise):
     """The gain settles to 1e-12, hence the vector to 1e-6 times one further step of convergence."""
     for _ in range(20):

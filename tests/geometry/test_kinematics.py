@@ -1,7 +1,5 @@
 """Forward kinematics, operators and Jacobian against matrix exponentials and finite differences."""
 
-import csv
-
 import numpy as np
 import pytest
 
@@ -9,36 +7,34 @@ from projservo_cli.geometry.kinematics import forward_kinematics, image_jacobian
 from projservo_cli.records import Model, no_lenses, prismatic_of
 from tests.samples import arm, face, frame, hat, in_frame, operators, pixels, poe
 
-TYPES = ["RRRRRR", "RRPRRR", "PRR", "RRRRRRR", "R", "RRRPP"]
+TYPES = ["RRPRRR", "PRR", "RRRRRRR", "R", "RRRPP"]
 
 
 def joints(model, seed=0):
     return np.random.default_rng(seed).uniform(-1.5, 1.5, len(model.q_reference))
 
 
-@pytest.mark.parametrize("types", TYPES)
-@pytest.mark.parametrize("seed", [None, 1])
-def test_forward_kinematics_is_the_product_of_exponentials(types, seed):
-    model = arm(types) if seed is None else in_frame(arm(types), frame(seed))
+@pytest.fixture(params=TYPES)
+def model(request):
+    """An arm in a projective frame."""
+    return in_frame(arm(request.param), frame(1))
+
+
+def test_forward_kinematics_is_the_product_of_exponentials(model):
     q = joints(model)
     assert forward_kinematics(model, q) == pytest.approx(poe(model, q), abs=1e-12)
     assert forward_kinematics(model, model.q_reference) == pytest.approx(np.eye(4), abs=0)
 
 
-@pytest.mark.parametrize("types", TYPES)
-@pytest.mark.parametrize("seed", [None, 1])
-def test_operators_are_conjugated_by_the_joints_before(types, seed):
+def test_operators_are_conjugated_by_the_joints_before(model):
     """Equation (19) with the truncated product; the printed Ĥ⁰ in its place would fail here."""
-    model = arm(types) if seed is None else in_frame(arm(types), frame(seed))
     q = joints(model, 3)
     assert joint_operators(model, q) == pytest.approx(operators(model, q), abs=1e-12)
     assert joint_operators(model, model.q_reference) == pytest.approx(model.H_hat_0, abs=0)
 
 
-@pytest.mark.parametrize("types", TYPES)
-def test_operators_are_the_derivatives_of_the_forward_kinematics(types):
+def test_operators_are_the_derivatives_of_the_forward_kinematics(model):
     """Central differences of step 1e-5: error of 1e-10, ∂H/∂q_i = Ĥ_i H."""
-    model = in_frame(arm(types), frame(2))
     q = joints(model, 4)
     H_hat = joint_operators(model, q)
     for i in range(len(q)):
@@ -47,10 +43,9 @@ def test_operators_are_the_derivatives_of_the_forward_kinematics(types):
         assert difference == pytest.approx(H_hat[i] @ forward_kinematics(model, q), abs=2e-9)
 
 
-@pytest.mark.parametrize("seed", [None, 5])
-def test_image_jacobian_is_the_derivative_of_the_pixels(seed):
+def test_image_jacobian_is_the_derivative_of_the_pixels():
     """Central differences of step 1e-5 on pixels of 1e3: error of 1e-6 px per rad."""
-    G = np.eye(4) if seed is None else frame(seed)
+    G = frame(5)
     model = in_frame(arm("RRPRRR"), G)
     M_0 = face() @ G.T
     q = model.q_reference + 0.1 * joints(model, 6)
@@ -89,16 +84,11 @@ def test_true_kinematics_reproduce_the_reference_pixels(reference_truth, shared_
     )
     body = np.c_[truth["markers_tool"], np.ones(len(truth["markers_tool"]))]
     M_0 = body @ np.array(truth["T_base_tool_at_reference"]).T
-    with open(shared_data / name / "validation.csv", encoding="utf-8", newline="") as file:
-        rows = list(csv.DictReader(file))
-    assert len({row["pose"] for row in rows}) == 200
-    worst = 0.0
-    last, s = None, np.zeros(0)
-    for row in rows:
-        if row["pose"] != last:
-            last = row["pose"]
-            q = np.array([float(row[f"q{i + 1}"]) for i in range(len(truth["joint_types"]))])
-            s = project(model.P, M_0 @ forward_kinematics(model, q).T)
-        seen = [[float(row[f"{axis}_{view}"]) for axis in "uv"] for view in ("left", "right")]
-        worst = max(worst, np.abs(s[:, int(row["marker"])] - seen).max())
-    assert worst < 2e-6
+    table = np.genfromtxt(shared_data / name / "validation.csv", delimiter=",", names=True)
+    q = np.stack([table[f"q{i + 1}"] for i in range(len(truth["joint_types"]))], axis=1)
+    seen = np.stack([table[f"{axis}_{view}"] for view in ("left", "right") for axis in "uv"], axis=1)
+    poses, first, which = np.unique(table["pose"], return_index=True, return_inverse=True)
+    assert len(poses) == 200
+    s = np.array([project(model.P, M_0 @ forward_kinematics(model, q[k]).T) for k in first])
+    off = s[which, :, table["marker"].astype(int)] - seen.reshape(-1, 2, 2)
+    assert np.abs(off).max() < 2e-6

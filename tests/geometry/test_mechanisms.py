@@ -18,11 +18,11 @@ from projservo_cli.geometry.mechanisms import (
 )
 from tests.samples import arm, face, frame, in_frame, prismatic, revolute
 
-TYPES = ["RRRRRR", "RRPRRR"]
 
-
-def setting(types, seed):
+@pytest.fixture(params=[(types, seed) for types in ("RRRRRR", "RRPRRR") for seed in (None, 1, 2)])
+def setting(request):
     """Operators, plane at infinity, face and frame of an arm away from its reference."""
+    types, seed = request.param
     G = np.eye(4) if seed is None else frame(seed, mirrored=seed == 2)
     model = in_frame(arm(types), G)
     q = model.q_reference + np.array([0.2, -0.3, 0.15, 0.4, -0.2, 0.3])
@@ -58,10 +58,8 @@ def check_rotation(H):
     assert np.trace(H) == pytest.approx(0.0, abs=1e-12)
 
 
-@pytest.mark.parametrize("types", TYPES)
-@pytest.mark.parametrize("seed", [None, 1, 2])
-def test_translation_keeps_every_plane_through_its_line(types, seed):
-    H_hat, a_inf, A, G = setting(types, seed)
+def test_translation_keeps_every_plane_through_its_line(setting):
+    H_hat, a_inf, A, G = setting
     mechanism = found(translation_mechanism, H_hat, A[0], A[1] - A[0])
     q_hat, H = check(mechanism, H_hat, a_inf)
     assert np.linalg.norm(q_hat) == pytest.approx(1.0, abs=1e-14)
@@ -77,10 +75,8 @@ def test_translation_keeps_every_plane_through_its_line(types, seed):
         assert np.abs(a @ H).max() < 1e-11
 
 
-@pytest.mark.parametrize("types", TYPES)
-@pytest.mark.parametrize("seed", [None, 1, 2])
-def test_revolution_keeps_its_axis(types, seed):
-    H_hat, a_inf, A, G = setting(types, seed)
+def test_revolution_keeps_its_axis(setting):
+    H_hat, a_inf, A, G = setting
     mechanism = found(rotation_mechanism, H_hat, A[0], A[2])
     _, H = check(mechanism, H_hat, a_inf)
     check_rotation(H)
@@ -93,12 +89,10 @@ def test_revolution_keeps_its_axis(types, seed):
     assert min(np.abs(metric - wanted).max(), np.abs(metric + wanted).max()) < 1e-11
 
 
-@pytest.mark.parametrize("types", TYPES)
-@pytest.mark.parametrize("seed", [None, 1, 2])
 @pytest.mark.parametrize("inside", [True, False])
-def test_planar_revolution_keeps_its_plane_and_its_point(types, seed, inside):
+def test_planar_revolution_keeps_its_plane_and_its_point(setting, inside):
     """About the perpendicular through the point, which need not lie in the plane."""
-    H_hat, a_inf, A, G = setting(types, seed)
+    H_hat, a_inf, A, G = setting
     a = plane_through(A)
     center = A[0] if inside else G @ [0.1, 0.1, 1.2, 1.0]
     mechanism = found(planar_mechanism, H_hat, a, center)
@@ -111,39 +105,23 @@ def test_planar_revolution_keeps_its_plane_and_its_point(types, seed, inside):
     assert min(np.abs(metric - wanted).max(), np.abs(metric + wanted).max()) < 1e-11
 
 
-def redundant():
-    model = arm("RRRRRRR")
-    return joint_operators(model, model.q_reference + 0.2)
-
-
-def two_on_one_axis():
-    H_hat = arm().H_hat_0.copy()
-    H_hat[4] = -H_hat[2]
-    return H_hat
-
-
-def gantry():
-    """Translations: the kernel of (9) holds no rotation that could be scaled to radians."""
-    return np.array([prismatic(axis) for axis in np.eye(3)])
-
-
-@pytest.mark.parametrize(
-    ("operators", "mechanisms"),
-    [
-        (redundant, (translation_mechanism, rotation_mechanism, planar_mechanism)),
-        (two_on_one_axis, (translation_mechanism,)),
-        (gantry, (rotation_mechanism,)),
-    ],
-)
-def test_an_arm_without_a_unique_motion_says_so(operators, mechanisms):
-    A = face()
-    given = {
-        translation_mechanism: (A[0], A[1] - A[0]),
-        rotation_mechanism: (A[0], A[1]),
-        planar_mechanism: (plane_through(A), A[0]),
-    }
-    for mechanism in mechanisms:
-        assert not found(mechanism, operators(), *given[mechanism])[0]
+def test_an_arm_without_a_unique_motion_says_so():
+    A, model = face(), arm("RRRRRRR")
+    translation = translation_mechanism, A[0], A[1] - A[0]
+    rotation = rotation_mechanism, A[0], A[1]
+    planar = planar_mechanism, plane_through(A), A[0]
+    redundant = joint_operators(model, model.q_reference + 0.2)
+    two_on_one_axis = arm().H_hat_0.copy()
+    two_on_one_axis[4] = -two_on_one_axis[2]
+    # Translations: the kernel of (9) holds no rotation that could be scaled to radians.
+    gantry = np.array([prismatic(axis) for axis in np.eye(3)])
+    for operators, mechanisms in (
+        (redundant, (translation, rotation, planar)),
+        (two_on_one_axis, (translation,)),
+        (gantry, (rotation,)),
+    ):
+        for mechanism, first, second in mechanisms:
+            assert not found(mechanism, operators, first, second)[0]
 
 
 # Arms: redundant ones, general short ones, and one whose joints turn about one direction alone.

@@ -1,5 +1,6 @@
 """Two views: epipolar geometry, centres, and triangulation that is exact, optimal, or refused."""
 
+import itertools
 import math
 
 import numpy as np
@@ -8,7 +9,7 @@ from scipy.optimize import least_squares
 
 from projservo_cli.geometry.stereo import fundamental_matrix, optical_centers, triangulate, triangulate_points
 from projservo_cli.records import WorkFailed
-from tests.samples import frame, hat, pixels, rig
+from tests.samples import displacement, frame, hat, pixels, rig
 
 METRIC = np.array([0.0, 0, 0, 1])
 PARALLEL = np.array([np.c_[np.eye(3), [side * 0.15, 0, 0]] for side in (1, -1)])
@@ -64,14 +65,12 @@ def test_clean_points_are_recovered(rng, seed):
     assert found @ a_inf == pytest.approx(np.ones(len(M)), abs=1e-12)
 
 
-@pytest.mark.parametrize("sigma", [0.1, 0.5, 5.0])
+@pytest.mark.parametrize("sigma", [0.1, 5.0])
 @pytest.mark.parametrize("turn", [0.0, 0.4])
 def test_noisy_points_have_the_least_reprojection_error(rng, sigma, turn):
     """Not beaten by a general optimiser started at the result, and stationary to its gradient."""
     P = rig()
-    P = np.array(
-        [P[0], P[1] @ np.block([[_turn(turn), np.zeros((3, 1))], [np.zeros((1, 3)), np.ones((1, 1))]])]
-    )
+    P[1] = P[1] @ displacement([0.0, 0.0, turn], np.zeros(3))  # rows are no epipolar lines then
     M = points(rng, 12)
     s = pixels(P, M) + sigma * rng.normal(size=(2, 12, 2))
     found = triangulate_points(P, METRIC, s)
@@ -86,12 +85,6 @@ def test_noisy_points_have_the_least_reprojection_error(rng, sigma, turn):
         assert ours <= 2 * best.cost * (1 + 1e-9) + 1e-15
         assert ours <= cost(P, M[k], s[:, k])
         assert found[k, :3] == pytest.approx(best.x, abs=1e-6 * sigma)
-
-
-def _turn(angle):
-    """Rotation about the viewing direction by angle, so that rows are no epipolar lines."""
-    c, s = math.cos(angle), math.sin(angle)
-    return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
 
 
 def test_points_do_not_depend_on_the_frame_nor_on_the_scale_of_a_camera(rng):
@@ -116,12 +109,11 @@ def test_rays_that_meet_at_infinity_are_refused():
             assert one(P, a_inf, (u, v), (u, v)) == (False, (0.0, 0.0, 0.0, 0.0))
 
 
-@pytest.mark.parametrize("bad", [math.nan, math.inf])
-@pytest.mark.parametrize("place", range(4))
-def test_pixels_that_are_no_numbers_are_refused(bad, place):
-    s = np.array([600.0, 500.0, 600.0, 500.0])
-    s[place] = bad
-    assert one(rig(), METRIC, s[:2], s[2:]) == (False, (0.0, 0.0, 0.0, 0.0))
+def test_pixels_that_are_no_numbers_are_refused():
+    for place, bad in itertools.product(range(4), (math.nan, math.inf)):
+        s = np.array([600.0, 500.0, 600.0, 500.0])
+        s[place] = bad
+        assert one(rig(), METRIC, s[:2], s[2:]) == (False, (0.0, 0.0, 0.0, 0.0))
 
 
 def test_the_marker_at_fault_is_named():

@@ -9,15 +9,11 @@ from tests.scene import Run, limits, scene, with_pins
 LAWS = ("direct_three", "direct_two", "exact")
 
 
-def body_run(sc, law, G=None, **given):
-    return Run(sc, law, G=G, task=sc.body_task(G), **given)
-
-
 @pytest.mark.parametrize("law", LAWS)
 def test_without_noise_both_observations_drive_alike(law):
     """With the true model what the body says is what the points say."""
     sc = with_pins(scene())
-    body, points = body_run(sc, law, frame(1)), Run(sc, law, G=frame(1))
+    body, points = (Run(sc, law, G=frame(1), task=task) for task in (sc.body_task(frame(1)), None))
     assert (body.verdict, body.steps) == (points.verdict, points.steps) == ("converged", points.steps)
     assert body.log.q == pytest.approx(points.log.q, abs=1e-7)
     assert (body.log.fit[:, 2] == 18).all()

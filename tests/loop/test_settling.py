@@ -97,16 +97,6 @@ def test_a_robot_that_gains_nothing_is_given_up_with_a_cause(read, what):
     assert k < 300
 
 
-def _still(k):
-    """Joints that stand, rad."""
-    return 0.1, 0.0
-
-
-def _far(k):
-    """A joint that moves on."""
-    return 0.01 * k, 0.0
-
-
 def test_markers_that_flicker_are_lost_and_no_local_minimum():
     """The robot is held, but for a frame now and then; a law that has images mostly is at fault itself."""
     for lost, told in ((0.9, MARKERS_LOST), (0.2, NO_PROGRESS)):
@@ -121,20 +111,23 @@ def test_markers_that_flicker_are_lost_and_no_local_minimum():
         assert k < 100
 
 
+STILL, FAR = (lambda k: (0.1, 0.0)), (lambda k: (0.01 * k, 0.0))  # joints that stand, and one that moves on
+
+
 def test_a_robot_that_moves_or_comes_nearer_or_sees_nothing_goes_on():
-    assert judged(lambda k: 50.0, _far, _far)[0] == RUNNING
-    assert judged(lambda k: 5.0 + 900.0 * 0.995**k, _still, _still, most=800)[0] == RUNNING
-    assert judged(lambda k: np.nan, _still, _still, verdict=WAITING)[0] == RUNNING
+    assert judged(lambda k: 50.0, FAR, FAR)[0] == RUNNING
+    assert judged(lambda k: 5.0 + 900.0 * 0.995**k, STILL, STILL, most=800)[0] == RUNNING
+    assert judged(lambda k: np.nan, STILL, STILL, verdict=WAITING)[0] == RUNNING
 
 
 def test_arrival_is_believed_once_the_robot_stands():
-    ruled, _, k = judged(lambda k: 0.4, _still, _still, carried=lambda k: 8.0 * 0.8**k)
+    ruled, _, k = judged(lambda k: 0.4, STILL, STILL, carried=lambda k: 8.0 * 0.8**k)
     assert ruled == CONVERGED
     assert k == 13  # 8 px fall below half a pixel
-    assert judged(lambda k: 0.4, _still, _still)[2] == 0
+    assert judged(lambda k: 0.4, STILL, STILL)[2] == 0
     # An arm that is off once it stands is driven on.
     ruled, _, k = judged(
-        lambda k: 0.9 if k < 20 else 1.5 * 0.9 ** (k - 20), _still, _still, carried=lambda k: 8.0 * (k < 20)
+        lambda k: 0.9 if k < 20 else 1.5 * 0.9 ** (k - 20), STILL, STILL, carried=lambda k: 8.0 * (k < 20)
     )
     assert ruled == CONVERGED
     assert k == 24

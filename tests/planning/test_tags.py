@@ -20,11 +20,6 @@ START = [135.19, -81.51, -99.29, -86.65, 116.76, 88.12]
 GOAL = [135.19, -81.51, -99.29, -241.35, 116.76, 88.12]
 
 
-def vector(degrees):
-    """Joints as a configuration has them."""
-    return f"{{joints: {degrees}, unit: deg}}"
-
-
 def scenario(*overrides, calibrated=False):
     """The scenario of the task with its tags, by the true model or by a calibration."""
     ends = [

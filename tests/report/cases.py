@@ -79,9 +79,9 @@ def case(name="paper", steps=SHORT, whole=False):
 
 
 @lru_cache
-def seen(names, name="paper"):
+def seen(names):
     """The material of a task seen by cameras of other names: the left and the right one in turn."""
-    config, _, material = case(name)
+    config, _, material = case()
     chosen = [v % 2 for v in range(len(names))]
 
     def of(model):

@@ -3,21 +3,12 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from projservo_cli.geometry.kinematics import forward_kinematics
 from projservo_cli.report.animation import motion_of, write_view
 from projservo_cli.simulation.arm import camera_center
 from tests.configured import truth_of
 from tests.report.cases import SHORT, case
-
-
-@pytest.fixture(scope="module")
-def shown():
-    config, _, material = case()
-    truth = truth_of(config)
-    scene = motion_of(truth.robot, material.plant, truth.M, material.plan, material.traces)
-    return truth, material, scene
 
 
 def test_cameras_on_the_tool_move_past_a_scene_that_stands_still(tmp_path):
@@ -45,8 +36,10 @@ def test_cameras_on_the_tool_move_past_a_scene_that_stands_still(tmp_path):
     assert text.count('"name":"right camera"') == 1 + len(trace.q)  # at first, and in each frame
 
 
-def test_the_robot_ends_at_the_tool_and_carries_the_face(shown):
-    truth, material, scene = shown
+def test_the_robot_ends_at_the_tool_and_carries_the_face():
+    config, _, material = case()
+    truth = truth_of(config)
+    scene = motion_of(truth.robot, material.plant, truth.M, material.plan, material.traces)
     assert list(scene.runs) == list(material.traces)
     for name, trace in material.traces.items():
         run = scene.runs[name]

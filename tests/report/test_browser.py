@@ -72,8 +72,7 @@ def pages(run, view, tmp_path_factory):
     return {"report": run.path.parent / PAGE_FILE, "comparison": comparison, "view": view}
 
 
-@pytest.mark.parametrize("width", [390, 1400])
-@pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
+@pytest.mark.parametrize(("width", "dark"), [(390, False), (1400, True)])
 @pytest.mark.parametrize("name", ["report", "comparison", "view"])
 def test_pages_fit_every_width_in_light_and_in_dark(browser, pages, name, width, dark):
     with opened(browser, pages[name], width, dark) as page:

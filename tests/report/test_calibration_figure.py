@@ -2,46 +2,28 @@ import dataclasses
 import json
 
 import numpy as np
-import pytest
-from matplotlib.container import BarContainer
 
 from projservo_cli.calibration import predict
 from projservo_cli.calibration.prediction import parameters_from
 from projservo_cli.config import load_config, to_yaml
 from projservo_cli.dependencies import steps_for
 from projservo_cli.records import Observation
-from projservo_cli.report import style
 from projservo_cli.report.report_data import Fit
 from projservo_cli.robots.frame_recorder import FrameRecorder
 from projservo_cli.store.run_file import Result, Run
-from tests.configured import calibrate, report_on
-from tests.known import configured
+from tests.configured import report_on
 from tests.report.cases import SPECS, case
 
 SPEC = SPECS["fig13_calibration"]
 SHIFT_PX = np.array([[0.3, -0.4], [-0.1, 0.2]])  # of each view
 
 
-@pytest.fixture(scope="module")
-def fitted():
-    """The paper's task, calibrated from its simulated trials."""
-    return Fit(*reversed(calibrate.run(configured("paper"))[:2]))
-
-
-def shifted(name="paper", size=1.0, **fields):
+def shifted(**fields):
     """A calibration and images that are what it predicts, but for one shift in each view."""
-    known = dataclasses.replace(case(name)[2].calibration, **fields)
-    q = case(name)[2].observation.q
-    images = predict(known, q) + size * SHIFT_PX[:, None]
+    known = dataclasses.replace(case()[2].calibration, **fields)
+    q = case()[2].observation.q
+    images = predict(known, q) + SHIFT_PX[:, None]
     return Fit(known, Observation(np.arange(len(q)) + 100, known.marker, q, images))
-
-
-def drawn(fit):
-    return style.drawn(SPEC.draw, SPEC.data(fit), SPEC.height)
-
-
-def bars(axes):
-    return [bar for group in axes.containers if isinstance(group, BarContainer) for bar in group]
 
 
 def test_residuals_are_seen_minus_predicted_where_they_were_seen():

@@ -3,7 +3,6 @@
 import dataclasses
 
 import numpy as np
-import pytest
 
 from projservo_cli.geometry.kinematics import forward_kinematics, project
 from projservo_cli.report.figures.joint_space import PIECES
@@ -13,23 +12,6 @@ from tests.known import asked
 from tests.report.cases import SPECS, case
 
 BOX = [[600.0, 480.0], [700.0, 480.0], [700.0, 560.0], [600.0, 560.0]]
-SPEC = SPECS["fig16_way"]
-
-
-@pytest.fixture(scope="module")
-def material():
-    """The paper's task with a box between start and goal; the model is the true one in another frame."""
-    _, bench, known = case()
-    scenario, trajectory = bench.scenario, asked("joint_space", 21, keep_out=[{"left": BOX, "right": BOX}])
-    search = JointSearch(scenario.goal_joints, 0.01)
-    plan = plan_task(known.calibrated, scenario.ends, trajectory, scenario.demands, search)
-    assert plan.feasible
-    return dataclasses.replace(known, plan=plan, trajectory=trajectory)
-
-
-@pytest.fixture(scope="module")
-def data(material):
-    return SPEC.data(material)
 
 
 def seen(material, q):
@@ -39,8 +21,15 @@ def seen(material, q):
     return np.moveaxis(project(truth.P, points), 0, 1)
 
 
-def test_trees_grow_from_start_and_goals_where_the_true_cameras_see_them(material, data):
-    plan = material.plan
+def test_trees_grow_from_start_and_goals_where_the_true_cameras_see_them():
+    """The paper's task with a box between start and goal; the model is the true one in another frame."""
+    _, bench, known = case()
+    scenario, trajectory = bench.scenario, asked("joint_space", 21, keep_out=[{"left": BOX, "right": BOX}])
+    search = JointSearch(scenario.goal_joints, 0.01)
+    plan = plan_task(known.calibrated, scenario.ends, trajectory, scenario.demands, search)
+    assert plan.feasible
+    material = dataclasses.replace(known, plan=plan, trajectory=trajectory)
+    data = SPECS["fig16_way"].data(material)
     roots = np.flatnonzero(plan.tree_parent < 0)
     np.testing.assert_array_equal(plan.tree_q[0], plan.q_start)
     assert len(roots) == 1 + plan.n_goals_tried

@@ -13,19 +13,13 @@ from tests.configured import calibrate, truth_of
 from tests.known import configured
 
 
-@pytest.fixture(scope="module")
-def calibrated():
-    """UR5, calibrated from 0.5 px, its observations and what the configuration knows of lengths."""
+def test_rows_agree_with_the_data_sheet_within_their_deviations():
+    """Of a UR5, calibrated from 0.5 px."""
     config = configured("ur5")
     observation, calibration, *_ = calibrate.run(config)
-    return config, observation.at_rest, calibration, report_inputs(config).lengths
-
-
-def test_rows_agree_with_the_data_sheet_within_their_deviations(calibrated):
-    config, observation, calibration, lengths = calibrated
-    metric, why = in_metres(calibration, lengths)
+    metric, why = in_metres(calibration, report_inputs(config).lengths)
     assert why == ""
-    q = chosen_poses(metric, Fit(calibration, observation))
+    q = chosen_poses(metric, Fit(calibration, observation.at_rest))
     assert len(np.unique(q, axis=0)) == 5
     rows = {row["quantity"]: row for row in metric_rows(metric, q)}
     # Angles and lengths of a UR5, of its maker; the distance of the cameras as configured.

@@ -1,13 +1,11 @@
 """Observation tables: what is read, what is refused and where, and round trips."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from projservo_cli.records import InputError, Observation
+from projservo_cli.records import VIEWS, InputError, Observation
 from projservo_cli.store.observation_tables import read_joint_list, read_table, write_table
 
 HEADER = "pose,marker,q1,q2,u_left,v_left,u_right,v_right"
@@ -47,6 +45,9 @@ BAD = {
     "negative deviation": ([SIGMAS, f"{ROWS[0]},-0.1,1"], ":2: sigma_left is '-0.1'; expected a positive"),
     "no deviation": ([SIGMAS, f"{ROWS[0]},,1"], ":2: sigma_left is ''; expected a finite number"),
     "open quote": ([HEADER, ROWS[0], '"0,1'], ":3: "),
+    "one column of a view": (["pose,marker,q1,u_left,v_left,u_right", "1,1,1,1,1,1"], "lacks .* v_right"),
+    "no view": (["pose,marker,q1", "1,1,1"], "lacks .* u_left"),
+    "a list without its joints": (["pose,camera,marker,u,v", "0,1,0,1,2"], "table: give --readings"),
     "nul byte": ([HEADER, "0,\0,1"], ":2: not a text file"),
 }  # fmt: skip
 
@@ -87,41 +88,41 @@ def test_a_list_of_joints_has_numbers_and_images_or_not(tmp_path):
 finite = st.floats(allow_nan=False, allow_infinity=False)
 
 
-@settings(max_examples=50)
+@settings(max_examples=60)
 @given(st.data())
 def test_writing_and_reading_is_exact(tmp_path_factory, data):
+    """Of one to four views, with or without deviations, times and poses in motion."""
+    views = data.draw(
+        st.sampled_from([("hand",), VIEWS, ("cam1", "cam2"), ("d", "left", "top"), (*VIEWS, "a", "b")])
+    )
     poses = data.draw(st.lists(st.integers(-(10**9), 10**9), min_size=1, max_size=4, unique=True))
     markers = sorted(data.draw(st.sets(st.integers(0, 10**6), min_size=1, max_size=3)))
+    shape = len(poses), len(views), len(markers)
     n = data.draw(st.integers(1, 3))
     q = np.array([[data.draw(finite) for _ in range(n)] for _ in poses])
-    images = np.array([data.draw(finite) for _ in range(len(poses) * len(markers) * 4)])
-    images = images.reshape(len(poses), 2, len(markers), 2)
-    for k, view, j in np.ndindex(images.shape[:3]):
-        if data.draw(st.booleans()):
-            images[k, view, j] = np.nan
-    stated = data.draw(st.floats(1e-3, 1e3)) * (
-        1.0 + np.arange(images[..., 0].size).reshape(images.shape[:3])
-    )
-    sigma = np.where(np.isnan(images[..., 0]), np.nan, stated)
-    table = Observation(np.array(poses), np.array(markers), q, images, sigma=sigma)
+    images = np.array([data.draw(finite) for _ in range(2 * np.prod(shape))]).reshape(*shape, 2)
+    images[np.array([data.draw(st.booleans()) for _ in range(np.prod(shape))]).reshape(shape)] = np.nan
+    rng, more = np.random.default_rng(data.draw(st.integers(0, 99))), {}
+    if data.draw(st.booleans()):
+        more["sigma"] = np.where(
+            np.isnan(images[..., 0]), np.nan, data.draw(st.floats(1e-3, 1e3)) + rng.random(shape)
+        )
+    if data.draw(st.booleans()):
+        t_q = 0.03 * np.arange(len(poses)) + 0.01 * rng.random(len(poses))
+        t_view = t_q[:, None] + 0.01 * rng.random(shape[:2])
+        t_view[rng.random(shape[:2]) < 0.2] = np.nan
+        more = more | {"moving": rng.integers(0, 3, len(poses)), "t_q": t_q, "t_view": t_view}
+        more["moving"][-1], more["t_view"][0, 0] = 1, 0.5  # what is nowhere is no column
+    table = Observation(np.array(poses), np.array(markers), q, images, view=views, **more)
     path = tmp_path_factory.mktemp("tables") / "table.csv"
     write_table(table, path)
     back = read_table(path, joint_unit="rad")
-    for name in ("pose", "marker", "q", "images", "sigma"):
-        np.testing.assert_array_equal(getattr(back, name), getattr(table, name))
-
-
-def test_poses_in_motion_and_times_come_back_and_stay_out_of_what_is_at_rest(tmp_path):
-    rng, path = np.random.default_rng(3), tmp_path / "table.csv"
-    t_view = rng.random((4, 2))
-    t_view[2, 1] = np.nan
-    moving, t_q = np.array([0, 1, 1, 2]), rng.random(4)
-    table = Observation(np.arange(4), np.arange(3), rng.random((4, 2)), rng.random((4, 2, 3, 2)), moving, t_q)
-    table = dataclasses.replace(table, t_view=t_view)
-    write_table(table, path)
-    found = read_table(path)
-    for name in ("pose", "marker", "q", "images", "moving", "t_q", "t_view"):
-        np.testing.assert_array_equal(getattr(found, name), getattr(table, name))
-    assert found.at_rest.pose.tolist() == [0]
-    write_table(found.at_rest, path)
-    assert read_table(path).moving is None
+    assert back.view == views
+    for name in ("pose", "marker", "q", "images", *more):
+        np.testing.assert_array_equal(getattr(back, name), getattr(table, name), err_msg=name)
+    if "moving" in more:
+        still = more["moving"] == 0
+        assert back.at_rest.pose.tolist() == table.pose[still].tolist()
+        if still.any():
+            write_table(back.at_rest, path)
+            assert read_table(path, joint_unit="rad").moving is None

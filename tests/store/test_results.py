@@ -1,25 +1,17 @@
 """A run as an object: what its calibration predicts, against differences and limits."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 import projservo_cli
-from projservo_cli import cli
-
-STANFORD = Path(__file__).parents[2] / "configs" / "stanford.yaml"
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("run")
-    assert cli.run(["calibrate", "-c", str(STANFORD), "-o", str(folder), "-q"]) == 0
-    return projservo_cli.load(folder)
+def calibration(calibrated_run):
+    return projservo_cli.load(calibrated_run("stanford")).calibration
 
 
-def test_the_jacobian_is_the_derivative_of_the_prediction(run):
-    calibration = run.calibration
+def test_the_jacobian_is_the_derivative_of_the_prediction(calibration):
     q = calibration.q_reference + np.array([0.2, -0.1, 0.05, 0.3, -0.2, 0.1])
     J = calibration.jacobian(q)
     assert J.shape == (2, 10, 2, 6)
@@ -30,8 +22,7 @@ def test_the_jacobian_is_the_derivative_of_the_prediction(run):
     np.testing.assert_array_equal(calibration.jacobian(np.array([q, q]))[1], J)
 
 
-def test_points_behind_a_camera_have_no_pixels_and_those_at_infinity_vanishing_points(run):
-    calibration = run.calibration
+def test_points_behind_a_camera_have_no_pixels_and_those_at_infinity_vanishing_points(calibration):
     centers = np.array([np.linalg.svd(P)[2][-1] for P in calibration.P])
     centers /= (centers @ calibration.a_inf)[:, None]
     behind = 2.0 * centers.mean(axis=0) - calibration.M.mean(axis=0)  # the face mirrored at the rig

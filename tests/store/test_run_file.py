@@ -65,7 +65,7 @@ def test_everything_comes_back(tmp_path):
     assert list(back.traces) == ["stacked", "direct_three"]
 
 
-@pytest.mark.parametrize("names", [("hand",), ("left", "right"), ("top", "left", "door")])
+@pytest.mark.parametrize("names", [("hand",), ("top", "left", "door")])
 def test_plans_and_runs_of_any_views_come_back_with_counts_by_name(tmp_path, names):
     trace = fake(Trace, 1, view=names)
     made = {"plan": result(**{"": fake(Plan, 2, view=names)}), "servo/exact": result(**{"": trace})}

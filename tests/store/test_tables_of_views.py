@@ -7,34 +7,20 @@ import pytest
 
 from projservo_cli.calibration.checks.validation import of_views
 from projservo_cli.records import VIEWS, InputError
-from projservo_cli.store.observation_tables import read_detections, read_table, write_table
+from projservo_cli.store.observation_tables import read_detections, read_table
 from tests.calibration.simulated_robot import random_robot, trials
 
 
 @pytest.fixture(scope="module")
 def seen():
-    """Observation by four views, some markers unseen, with stamps and deviations."""
+    """Observation by four views, some markers unseen, with deviations."""
     rng = np.random.default_rng(3)
     robot = random_robot("RRR", rng, markers=5, views=4)
     q = trials(robot, frames=2)
     seen = robot.observe(q, 0.5, rng)
     seen.images[rng.random(seen.images.shape[:3]) < 0.2] = np.nan
     sigma = np.where(np.isfinite(seen.images[..., 0]), 0.5, np.nan)
-    t = np.arange(4.0 * len(q)).reshape(-1, 4) + 0.25
-    return dataclasses.replace(seen, sigma=sigma, t_q=np.arange(float(len(q))) + 0.5, t_view=t)
-
-
-def same(one, other):
-    for name in ("pose", "marker", "q", "images", "sigma", "t_q", "t_view"):
-        np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
-    assert one.view == other.view
-
-
-@pytest.mark.parametrize("which", [[0], [0, 1], [2, 3], [3, 0, 2], [0, 1, 2, 3]])
-def test_a_table_of_any_views_comes_back(seen, which, tmp_path):
-    some = of_views(seen, tuple(seen.view[v] for v in which))
-    write_table(some, tmp_path / "table.csv")
-    same(read_table(tmp_path / "table.csv", "RRR"), some)
+    return dataclasses.replace(seen, sigma=sigma)
 
 
 def test_left_and_right_are_in_this_order_whatever_that_of_the_columns(tmp_path):
@@ -61,8 +47,9 @@ def test_a_list_of_detections_beside_joints_is_the_same_recording(seen, tmp_path
     for name, rows in zip(("d.csv", "q.csv"), listed(seen), strict=True):
         (tmp_path / name).write_text("\n".join(rows) + "\n")
     found = read_detections(tmp_path / "d.csv", tmp_path / "q.csv", "RRR")
-    expected = dataclasses.replace(of_views(seen, found.view), t_q=None, t_view=None)
-    same(found, expected)
+    expected = of_views(seen, found.view)
+    for name in ("pose", "marker", "q", "images", "sigma"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), err_msg=name)
 
 
 ERRORS = {
@@ -83,21 +70,6 @@ def test_an_error_of_a_list_names_its_line(name, tmp_path):
     with pytest.raises(InputError) as error:
         read_detections(tmp_path / "d.csv", tmp_path / "q.csv")
     assert message in str(error.value)
-
-
-@pytest.mark.parametrize(
-    "header", ["pose,marker,q1", "pose,marker,q1,u_left,v_left,u_right", "pose,marker,q1,u_top"]
-)
-def test_a_view_needs_both_columns(header, tmp_path):
-    (tmp_path / "t.csv").write_text(f"{header}\n{','.join('1' for _ in header.split(','))}\n")
-    with pytest.raises(InputError, match=r"lacks the column\(s\) (u_left|v_right)"):
-        read_table(tmp_path / "t.csv")
-
-
-def test_a_list_without_its_joints_is_told_where_they_go(tmp_path):
-    (tmp_path / "d.csv").write_text("pose,camera,marker,u,v\n0,1,0,1,2\n")
-    with pytest.raises(InputError, match="has its joints in another table: give --readings"):
-        read_table(tmp_path / "d.csv")
 
 
 def test_a_view_that_is_missing_is_named(seen):

@@ -29,18 +29,11 @@ class Dask:
             time.sleep(0.1)
         self.address = json.loads(self.file.read_text(encoding="utf-8"))["address"]
 
-    def _start(self, kind, *options):
+    def _start(self, kind, *more):
         command = [sys.executable, "-m", f"distributed.cli.dask_{kind}", "--scheduler-file", str(self.file)]
-        self.processes.append(
-            subprocess.Popen(
-                [*command, "--no-dashboard", *options],
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.DEVNULL,
-                env=processes.ENVIRONMENT,
-                cwd=self.folder,
-                start_new_session=True,
-            )
-        )
+        silent = dict.fromkeys(("stdout", "stderr"), subprocess.DEVNULL)
+        options = {"env": processes.ENVIRONMENT, "cwd": self.folder, "start_new_session": True, **silent}
+        self.processes.append(subprocess.Popen([*command, "--no-dashboard", *more], **options))
 
     def kill(self):
         """End the scheduler, then what is left of the workers."""
@@ -56,7 +49,9 @@ def cluster(tmp_path):
     started.kill()
 
 
-def test_a_killed_worker_is_made_up_for_and_a_killed_scheduler_gone_on_after(cluster, whole, tmp_path):
+def test_a_killed_worker_is_made_up_for_and_a_killed_scheduler_gone_on_after(
+    cluster, whole, tmp_path, projservo
+):
     config, reference = whole
     out = tmp_path / "out"
     process = processes.start(config, out, "--scheduler", cluster.address)
@@ -71,7 +66,7 @@ def test_a_killed_worker_is_made_up_for_and_a_killed_scheduler_gone_on_after(clu
     assert "Traceback" not in err, err
     stored = len(processes.parts(out))
     assert 8 <= stored < 2 * processes.RUNS / processes.CHUNK
-    code, _, err = processes.finish(processes.start(config, out, "-j", "1"))
-    assert code == 0, err
-    assert f"{processes.CHUNK * stored} of {2 * processes.RUNS} runs are stored already" in err
+    last = projservo("sweep", "-c", config, "-o", out, "-j", "1")
+    assert last.code == 0, last.err
+    assert f"{processes.CHUNK * stored} of {2 * processes.RUNS} runs are stored already" in last.err
     assert not processes.differences(out, reference)

@@ -17,7 +17,7 @@ from tests.sweeps.cases import columns, design, make
 pytestmark = pytest.mark.volume
 
 
-def test_interrupted_then_killed_it_is_in_the_end_as_if_nothing_had_been(whole, tmp_path):
+def test_interrupted_then_killed_it_is_in_the_end_as_if_nothing_had_been(whole, tmp_path, projservo):
     config, reference = whole
     process = processes.start(config, tmp_path, "-j", "2")
     processes.wait_for_parts(process, tmp_path, 2)
@@ -37,16 +37,11 @@ def test_interrupted_then_killed_it_is_in_the_end_as_if_nothing_had_been(whole, 
     processes.kill_group(process)
     stored = len(processes.parts(tmp_path))
     assert processes.CHUNK * stored < 2 * processes.RUNS
-    code, out, err = processes.finish(processes.start(config, tmp_path, "-j", "1", "--json"))
-    assert code == 0, err
-    assert f"{processes.CHUNK * stored} of {2 * processes.RUNS} runs are stored already" in err
-    told = json.loads(out)
-    assert (told["complete"], told["runs"], told["done"], told["cells"]) == (
-        True,
-        2 * processes.RUNS,
-        2 * processes.RUNS,
-        2,
-    )
+    last = projservo("sweep", "-c", config, "-o", tmp_path, "-j", "1", "--json")
+    assert last.code == 0, last.err
+    assert f"{processes.CHUNK * stored} of {2 * processes.RUNS} runs are stored already" in last.err
+    told = [last.json[name] for name in ("complete", "runs", "done", "cells")]
+    assert told == [True, 2 * processes.RUNS, 2 * processes.RUNS, 2]
     assert not processes.differences(tmp_path, reference)
     assert not processes.parts(tmp_path)
 
@@ -65,9 +60,8 @@ def test_the_table_opens_in_xarray_and_pandas(whole):
     for name, values in ours.items():
         if name != "run":
             assert frame[name].tolist() == pytest.approx(values.tolist(), nan_ok=True, abs=0)
-    assert frame.groupby("law")["steps"].count().to_dict() == {
-        "direct_two": processes.RUNS,
-        "stacked": processes.RUNS,
+    assert set(frame.groupby("law")["steps"].count().to_dict().items()) == {
+        (law, processes.RUNS) for law in ("direct_two", "stacked")
     }
     with xarray.open_dataset(folder / "sweep.h5", group=f"traces/{processes.RUNS}") as trace:
         assert trace.sizes["time"] == ours["steps"][processes.RUNS] + 1
@@ -105,17 +99,17 @@ def test_threads_give_the_same_and_are_left_in_order(tmp_path):
         return [thread for thread in threading.enumerate() if "ThreadPool" in thread.name]
 
     def interrupt(what, done, total):
-        if what == "runs" and done >= 10:
+        if what == "runs" and done >= 4:
             assert threads()
             raise KeyboardInterrupt
 
-    found = design(runs=30, chunk=5, calibrations=2)
+    found = design(runs=12, chunk=2, calibrations=2)
     assert make(found, tmp_path / "one").complete
     reference = columns(tmp_path / "one")
     with pytest.raises(KeyboardInterrupt):
         make(found, tmp_path / "two", workers=2, progress=interrupt)
     assert not threads()
-    assert 10 <= len(columns(tmp_path / "two")["run"]) < 60
+    assert 4 <= len(columns(tmp_path / "two")["run"]) < 24
     assert make(found, tmp_path / "two", workers=2).complete
     for name, values in columns(tmp_path / "two").items():
         assert values.tobytes() == reference[name].tobytes(), name

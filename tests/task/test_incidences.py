@@ -126,12 +126,12 @@ def deviating(generator, n=6, size=0.2):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_kind_is_met_with_the_same_joints_in_any_frame_and_leaves_free_what_it_should(kind):
-    for seed in range(10):
+    for seed in range(3):
         generator = np.random.default_rng([seed, KINDS.index(kind)])
         model, M = random_arm(generator)
         q_star = model.q_reference + deviating(generator)
         q = q_star + deviating(generator)
-        cases = [Case(model, M, asked_of(kind), q_star, G) for G in (None, frame(seed), frame(seed + 99))]
+        cases = [Case(model, M, asked_of(kind), q_star, G) for G in (None, frame(seed))]
         ends = np.array([case.drive(q) for case in cases])
         assert np.abs(ends - ends[0]).max() <= 1e-10, seed
         for case, end in zip(cases, ends, strict=True):
@@ -147,7 +147,7 @@ def test_every_kind_is_met_with_the_same_joints_in_any_frame_and_leaves_free_wha
 
 def test_the_rows_of_a_whole_pose_give_its_image_error_and_overlap_without_harm():
     """To first order the least motion of all images is that of the pose; nine rows are six."""
-    for seed in range(20):
+    for seed in range(5):
         generator = np.random.default_rng([7, seed])
         model, M = random_arm(generator)
         q_star = model.q_reference + deviating(generator)
@@ -226,7 +226,7 @@ def test_angles_need_axes_that_are_not_parallel():
 
 
 def test_a_line_is_turned_across_itself_although_no_first_step_lowers_the_error():
-    for seed in range(5):
+    for seed in range(3):
         generator = np.random.default_rng([23, seed])
         model, M = random_arm(generator)
         case = Case(model, M, [Incidence("pin", LINE, LINE, PERPENDICULAR)], model.q_reference)

@@ -85,19 +85,13 @@ def test_any_displacement(rotation_vector, translation, seed):
     check(Split(SQUARE, T, frame(seed)), accuracy=1e-9)
 
 
-def metric_angles(T):
-    """Angle between the normals, and of the rotation as a whole, by its rotation matrix."""
-    R = T[:3, :3]
-    whole = math.acos(max(-1.0, min(1.0, (np.trace(R) - 1) / 2)))
-    return math.acos(max(-1.0, min(1.0, R[2, 2]))), whole
-
-
 @pytest.mark.parametrize("name", CASES)
 def test_amplitudes_are_the_metric_ones(name):
     """θ_r is the angle between the normals, cos(θ_s/2) = cos(θ_r/2) cos(θ_p/2), τ q̂_t moves the centre."""
     split = Split(SQUARE, CASES[name], frame(3))
     tau, theta_r, theta_p = split.amplitudes
-    between, whole = metric_angles(CASES[name])
+    R = CASES[name][:3, :3]
+    between, whole = (math.acos(np.clip(cosine, -1.0, 1.0)) for cosine in (R[2, 2], (np.trace(R) - 1) / 2))
     # acos near ±1 leaves the root of the round-off.
     assert min(abs(theta_r), 2 * math.pi - abs(theta_r)) == pytest.approx(between, abs=5e-8)
     assert abs(math.cos(theta_r / 2) * math.cos(theta_p / 2)) == pytest.approx(math.cos(whole / 2), abs=1e-8)

@@ -25,13 +25,15 @@ def displaced(model, M, q, asked, G, metre=1.0):
 @pytest.mark.parametrize("kind", ALONG)
 @pytest.mark.parametrize("amount", [{"by_m": 0.05}, {"by_m": -0.02}, {"by_px": 30.0}, {"by_px": -7.0}])
 def test_a_displaced_goal_is_as_far_as_asked_for_in_any_frame(kind, amount):
-    for seed in range(20):
+    for seed in range(5):
         generator = np.random.default_rng(seed)
         model, M = random_arm(generator)
         q = model.q_reference + deviating(generator)
         asked = StandOff("pin", ALONG[kind], **({"by_m": None, "by_px": None} | amount))
-        frames = [np.eye(4), frame(seed), frame(seed + 99)]
-        units = [_unit(model, M, q, G) for G in frames]
+        frames = [np.eye(4), frame(seed)]
+        apart = np.zeros((len(M), len(M)))
+        apart[0, 2] = np.linalg.norm(M[0] - M[2])  # a length that is known
+        units = [metres_a_unit(in_frame(model, G), M @ G.T, apart) for G in frames]
         each = [displaced(model, M, q, asked, G, u) for G, u in zip(frames, units, strict=True)]
         each = [back / back[3, 3] for back in each]
         assert np.abs(np.array(each) - each[0]).max() < 1e-8, seed
@@ -51,13 +53,6 @@ def test_a_displaced_goal_is_as_far_as_asked_for_in_any_frame(kind, amount):
         apart = np.linalg.norm(project(model.P, there @ H.T) - project(model.P, there), axis=2)
         apart[0, 3] = np.nan
         assert np.nanmean(apart, axis=1).max() == pytest.approx(abs(amount["by_px"]), rel=1e-9)
-
-
-def _unit(model, M, q, G):
-    """Metres a unit of the metric in a frame, by two markers."""
-    apart = np.zeros((len(M), len(M)))
-    apart[0, 2] = np.linalg.norm(M[0] - M[2])
-    return metres_a_unit(in_frame(model, G), M @ G.T, apart)
 
 
 def test_what_cannot_be_displaced_is_refused_in_one_line():

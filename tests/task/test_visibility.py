@@ -128,7 +128,7 @@ def test_margin_coefficients_describe_the_carried_plane(G, rng):
         assert c_0 + c_s * math.sin(theta) + c_c * math.cos(theta) == pytest.approx(wanted, abs=1e-11)
 
 
-@settings(max_examples=300)
+@settings(max_examples=100)
 @given(small, small, small, st.floats(-2 * math.pi, 2 * math.pi))
 def test_least_margin_of_an_arc_by_brute_force(c_0, c_s, c_c, theta):
     """A grid of 4001 angles over at most one turn misses the least value by 1.3e-6 of the amplitude."""
@@ -182,12 +182,16 @@ def chosen(a, a_t, H_hat, theta, task, against_previous=False):
 
 
 def test_sense_of_the_turn_by_brute_force():
-    """Fewest cameras lose sight; among equals, away from 180°, the better worst margin."""
+    """Fewest cameras lose sight; among equals, away from 180°, the better worst margin; in any frame."""
     other_taken = differ = 0
     for seed in range(40):
         a, a_t, H_hat, theta, task = sense_case(seed)
         result = chosen(a, a_t, H_hat, theta, task)
         assert result in (theta, theta - 2 * math.pi)
+        G = frame(seed, mirrored=seed % 2 == 1)
+        back = np.linalg.inv(G)
+        there = task._replace(O=np.ascontiguousarray(task.O @ G.T))
+        assert chosen(a @ back, a_t @ back, G @ H_hat @ back, theta, there) == result
         taken, left = (arc_margins(a, H_hat, t, task) for t in (result, theta - 2 * math.pi + theta - result))
         assert (taken <= 0).sum() <= (left <= 0).sum()
         if (taken <= 0).sum() == (left <= 0).sum() and math.pi - theta > 0.5:
@@ -219,14 +223,3 @@ def test_sight_counts_more_than_the_sense_of_the_step_before(theta):
     blind = task._replace(O=O, visible=np.ones(2))
     assert chosen(a, a_t, H_hat, theta, blind, against_previous=True) == theta - 2 * math.pi
     assert chosen(a, a_t, H_hat, theta, blind, against_previous=False) == theta
-
-
-def test_the_mirrored_rig_mirrors_nothing_in_the_sense():
-    """The sense is a property of the scene: the same in every projective frame."""
-    for seed in range(20):
-        a, a_t, H_hat, theta, task = sense_case(seed)
-        wanted = chosen(a, a_t, H_hat, theta, task)
-        G = frame(seed, mirrored=seed % 2 == 1)
-        back = np.linalg.inv(G)
-        there = task._replace(O=np.ascontiguousarray(task.O @ G.T))
-        assert chosen(a @ back, a_t @ back, G @ H_hat @ back, theta, there) == wanted
