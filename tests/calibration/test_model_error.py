@@ -7,7 +7,7 @@ import pytest
 from scipy.linalg import expm
 
 from projservo_cli.calibration import calibrate, predict
-from projservo_cli.calibration.checks.model_error import _SIZES, describe
+from projservo_cli.calibration.checks import model_error
 from projservo_cli.records import ModelError, Observation, WorkFailed
 from tests.calibration.simulated_robot import around, random_robot, trials
 
@@ -88,17 +88,17 @@ def test_a_large_effect_is_not_usable_until_it_is_accepted():
 def test_every_kind_has_words_and_a_code():
     """Sizes are told in per cent, degrees, mm and px, and a code leads back to the record."""
     prismatic = np.array([False, True])
-    for kind in _SIZES:
+    for kind in model_error._SIZES:
         joints = {"coupling": (1, 2), "base": (), "tool": ()}.get(kind, (1,))
         one = ModelError(kind, joints, "left", -0.02, 0.001, 0.5, 3, ("joint_step|2|", "base||"))
         assert ModelError.of(one.code, one.numbers) == one
-        limit, sentence = describe(one, prismatic)
+        limit, sentence = model_error.describe(one, prismatic)
         assert limit
         assert (
             "(or step of joint 2, or motion of the base or the cameras: the images do not tell)" in sentence
         )
         assert any(unit in sentence for unit in ("%", "°", "px", "mm"))
-    assert "mm" in describe(ModelError("joint_step", (2,), "", 0.02, 0.001, 0.5, 3), prismatic)[1]
+    assert "mm" in model_error.describe(ModelError("joint_step", (2,), "", 0.02, 0.001, 0.5, 3), prismatic)[1]
 
 
 @pytest.mark.parametrize("moved", [(0, 1), (1,)])
