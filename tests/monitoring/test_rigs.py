@@ -93,7 +93,7 @@ def test_a_joint_that_slips_is_named_as_a_joint(case, joint):
 def test_a_joint_of_the_other_sign_that_puts_all_markers_behind_the_camera_explains_nothing():
     """The camera stands on the axis of the first joint, whose readings are near a quarter of a turn."""
     rng = np.random.default_rng(3)
-    robot = random_robot("RRRR", rng, markers=8, views=1)
+    robot = random_robot("RRR", rng, markers=8, views=1)
     center = np.linalg.svd(robot.cameras[0])[2][-1]
     center = center[:3] / center[3]  # it looks at the origin
     robot.twists[0] = revolute(center, np.cross(center, rng.standard_normal(3)))
