@@ -127,13 +127,6 @@ def test_case_10_password_in_page(entered, told, tmp_path):
     assert all(b"secret123" not in path.read_bytes() for path in tmp_path.rglob("*.html"))
 
 
-def spreadsheet(lines, separator, comma=False, head=""):
-    """Lines of a table as a spreadsheet writes them."""
-    rows = [line.split(",") for line in lines]
-    cells = [[cell.replace(".", ",") if comma else cell for cell in row] for row in rows]
-    return "\n".join([*head.splitlines(), *(separator.join(row) for row in cells)]) + "\n"
-
-
 @pytest.mark.parametrize(
     ("separator", "comma", "head", "encoding"),
     [
@@ -143,27 +136,25 @@ def spreadsheet(lines, separator, comma=False, head=""):
 )  # fmt: skip
 @pytest.mark.parametrize("unseen", ["", "nan", "NaN", "NA", "#N/A"])
 def test_a_table_of_a_spreadsheet_is_read(recorded, tmp_path, separator, comma, head, encoding, unseen):
-    header, *rows = recorded.read_text().splitlines()
-    wanted, given = [], []
-    for line in rows[:40]:
-        cells = line.split(",")
-        for i in range(len(cells)):
-            if header.split(",")[i].endswith("_left") and cells[1] == "2":
-                cells[i] = ""
-        wanted.append(",".join(cells))
-        given.append(",".join(unseen if name[:2] in ("u_", "v_") and cell == "" else cell
-                              for name, cell in zip(header.split(","), cells, strict=True)))  # fmt: skip
-    (tmp_path / "plain.csv").write_text("\n".join([header, *wanted]) + "\n")
-    sheet = spreadsheet([header, *given], separator, comma, head)
-    (tmp_path / "sheet.csv").write_text(sheet, encoding=encoding)
-    one, other = read_table(tmp_path / "plain.csv"), read_table(tmp_path / "sheet.csv")
+    header, *rows = (line.split(",") for line in recorded.read_text().splitlines()[:41])
+    at = header.index("u_left")
+    for row in rows:
+        row[at : at + 2] = ["", ""] if row[1] == "2" else row[at : at + 2]
+
+    def written(name, separator, comma, head, unseen, encoding):
+        lines = [[cell or unseen for cell in row] for row in (header, *rows)]
+        cells = [[cell.replace(".", ",") if comma else cell for cell in row] for row in lines]
+        text = "\n".join([*head.splitlines(), *(separator.join(row) for row in cells)])
+        (tmp_path / name).write_text(text + "\n", encoding=encoding)
+        return tmp_path / name
+
+    one = read_table(written("plain.csv", ",", False, "", "", "utf-8"))
+    other = read_table(written("sheet.csv", separator, comma, head, unseen, encoding))
     np.testing.assert_array_equal(one.images, other.images)
     np.testing.assert_array_equal(one.q, other.q)
-    broken = sheet.replace(rows[39].split(",")[2].replace(".", "," if comma else "."), "x")
-    (tmp_path / "broken.csv").write_text(broken, encoding=encoding)
-    line = broken.splitlines().index(next(row for row in broken.splitlines() if separator + "x" in row)) + 1
-    with pytest.raises(InputError, match=f"broken.csv:{line}: q1 is 'x'"):
-        read_table(tmp_path / "broken.csv")
+    rows[-1][2] = "x"
+    with pytest.raises(InputError, match=f"broken.csv:{len(rows) + 1 + bool(head)}: q1 is 'x'"):
+        read_table(written("broken.csv", separator, comma, head, unseen, encoding))
 
 
 @pytest.mark.parametrize(

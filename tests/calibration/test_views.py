@@ -76,19 +76,6 @@ def test_order_and_names_of_views_do_not_matter():
     np.testing.assert_allclose(predict(turned, ahead), predict(found, ahead)[:, [2, 0, 3, 1]], atol=1e-3)
 
 
-def test_a_third_view_with_few_markers_and_poses_is_of_use():
-    robot, q, ahead, rng = recorded(3, seed=3)
-    seen = robot.observe(q, 0.5, rng)
-    seen.images[::2, 2] = np.nan
-    seen.images[:, 2, :3] = np.nan
-    error = []
-    for which in ([0, 1], [0, 1, 2]):
-        found = calibrate(of_views(seen, which), robot.joint_types, source="recorded")
-        off = predict(found, ahead)[:, :2] - robot.images(ahead)[:, :2]
-        error.append(float(np.sqrt(np.mean(off**2))))
-    assert error[1] < error[0]
-
-
 @pytest.mark.parametrize(("types", "flat"), [("RRPR", False), ("RRRR", True)])
 def test_one_camera_is_enough(types, flat):
     rng = np.random.default_rng(11)

@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from scipy.linalg import expm
 
 from projservo_cli.calibration import calibrate as calibrated
 from projservo_cli.calibration.prediction import (
@@ -121,7 +120,7 @@ def test_a_marker_is_tested_by_the_deviation_it_states(arm):
     assert first_alarm(arm, q, s, stated=stated) == (None, "")
     assert first_alarm(arm, q, s) == (None, "")
     moved = np.repeat(arm.scene.M[None], len(q), 0)
-    loose(Struck(None, None, moved[20:], None), (4,))  # by less than what the others are off
+    loose(Struck(None, None, moved[20:]), (4,))  # by less than what the others are off
     s += arm.images(at_once(q), moved) - arm.images(at_once(q))
     assert 20 <= first_alarm(arm, q, s, stated=stated)[0] < 40
     s[20:, 1, 4] = np.nan  # something may hide what a single camera shows
@@ -145,7 +144,6 @@ class Struck(NamedTuple):
     q: np.ndarray  # (k, n) true joints, rad
     read: np.ndarray  # (k, n) readings, rad
     moved: np.ndarray  # (k, m, 4) markers
-    shift: np.ndarray  # (k, 2, 1, 2) of images, px
 
 
 def slipped(struck, joint):
@@ -156,21 +154,9 @@ def frozen(struck, joint):
     struck.read[:, joint] = struck.read[0, joint]
 
 
-def bumped(struck, view):
-    struck.shift[:, view] = (1.6, -1.2)
-
-
 def loose(struck, markers, by=0.004):
     for j in markers:
         struck.moved[:, j, :3] += by * np.array([0.6, -0.48, 0.64]) * (-1.0) ** j
-
-
-def knocked_tool(struck):
-    middle, w = struck.moved[0].mean(axis=0)[:3], np.array([0.02, -0.03, 0.02])
-    twist = np.zeros((4, 4))
-    twist[:3, :3] = np.cross(w, np.eye(3)).T
-    twist[:3, 3] = np.array([0.004, 0.006, -0.004]) - twist[:3, :3] @ middle
-    struck.moved[:] = struck.moved @ expm(twist).T
 
 
 FAULTS = [
@@ -178,10 +164,7 @@ FAULTS = [
     (slipped, (5,), "joint 6 slipped by"),
     (frozen, (1,), "the reading of joint 2 stands still"),
     (frozen, (slice(None),), "the reading of all joints stands still"),
-    (bumped, (1,), "the right camera was moved"),
-    (loose, ((4,),), "marker {4} moved on the tool"),
     (loose, ((2, 5), 0.006), "markers {2}, {5} moved on the tool"),
-    (knocked_tool, (), "the tool was moved in its holder"),
 ]
 
 
@@ -193,9 +176,8 @@ def test_each_fault_is_named_soon(arm, strikes, where, name):
     onset = STEPS // 3
     read = TICK * np.round(q / TICK)
     moved = np.repeat(arm.scene.M[None], len(q), 0)
-    shift = np.zeros((len(q), 2, 1, 2))
-    strikes(Struck(q[onset:], read[onset:], moved[onset:], shift[onset:]), *where)
-    s = noisy(arm.images(at_once(q), moved) + shift, seed)
+    strikes(Struck(q[onset:], read[onset:], moved[onset:]), *where)
+    s = noisy(arm.images(at_once(q), moved), seed)
     k, said = first_alarm(arm.with_joint_noise(TICK / np.sqrt(12.0)), read, s)
     for j, number in enumerate(arm.calibration.marker):
         name = name.replace(f"{{{j}}}", str(number))
@@ -338,22 +320,6 @@ def test_in_one_posture_links_that_flex_are_said_beside_cameras_that_moved_alike
     large = first_alarm(arm, q, noisy(arm.images(at_once(q)), seed) + np.array([40.0, -40.0]))[1]
     assert "both cameras were moved alike" in large
     assert "flex" not in large
-
-
-def test_looks_in_which_a_hand_comes_and_goes_are_not_kept(arm):
-    """It hides three markers of a view, then all but three, and three again; pulled corners hardly show."""
-    q, _ = arm.way(3)
-    q = q[:: len(q) // 24][:24]
-    s = noisy(arm.images(at_once(q)), 3)
-    s[8:12, 1, :3] = s[16:18, 1, :3] = np.nan
-    s[12:16, 1, :7] = np.nan
-    test, views = ImageMonitor(arm.calibration, SIGMA, LOOKS), []
-    for k in range(len(q)):
-        look(test, k, q[k], s[k])
-        views.append(test._detector.memory.state.views)
-    assert views[7] < views[11]
-    assert views[12] == views[17] == views[7]
-    assert views[-1] > views[17]
 
 
 @pytest.mark.parametrize(

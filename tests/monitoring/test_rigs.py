@@ -1,4 +1,4 @@
-"""Faults of rigs of one and three cameras of any names, fixed or on the tool: what is named, how often."""
+"""Faults of rigs of one to three cameras of any names, fixed or on the tool: what is named, how often."""
 
 import dataclasses
 import re
@@ -18,7 +18,7 @@ from tests.calibration.simulated_robot import around, random_robot, revolute, tr
 from tests.calibration.test_cameras_on_the_tool import Hand
 from tests.monitoring.test_image_monitor import LOOKS, PERIOD, Arm, first_alarm, look, noisy
 
-RIGS = [(1, "world"), (3, "world"), (1, "tool")]
+RIGS = [(1, "world"), (2, "world"), (3, "world"), (1, "tool")]
 TYPES, NAMES, ONSET = "RRPRR", ("wrist", "top", "low"), 15
 NOISE = np.array([0.5, 0.5, 1.0])  # of each view, px
 
