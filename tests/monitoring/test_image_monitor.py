@@ -160,7 +160,6 @@ def loose(struck, markers, by=0.004):
 
 
 FAULTS = [
-    (slipped, (3,), "joint 4 slipped by"),
     (slipped, (5,), "joint 6 slipped by"),
     (frozen, (1,), "the reading of joint 2 stands still"),
     (frozen, (slice(None),), "the reading of all joints stands still"),
@@ -279,12 +278,16 @@ BENT_TAG = [
 ]
 
 
-@pytest.mark.parametrize(("seed", "off", "changed"), [(6, 1.2, ""), (0, 3.0, "at marker 6")])
-def test_a_tag_that_is_off_by_less_than_a_pixel_in_one_posture_is_no_fault(arm, seed, off, changed):
-    """One view of the tool does not tell a slanted tag from one that moved by as little."""
+@pytest.mark.parametrize(
+    ("seed", "off", "shift", "changed"),
+    [(6, 1.2, 0.0, ""), (6, 1.2, 3.0, "left camera"), (0, 3.0, 0.0, "at marker 6")],
+)
+def test_a_tag_that_is_off_by_less_than_a_pixel_in_one_posture_is_no_fault(arm, seed, off, shift, changed):
+    """One view does not tell a slanted tag from one that moved by as little; it hides no camera that moved."""
     sharp, q = dataclasses.replace(arm.calibration, sigma_px=0.1), arm.way(seed)[0][-1]
     s = noisy(arm.images(at_once(q[None])), seed, 0.1)[0]
     s[:, 4:8] += off * np.array(BENT_TAG)
+    s[0] += shift
     said = detected_fault(sharp, q, sharp.marker, s, arm.image_size)
     assert changed in said if changed else said == ""
 
