@@ -283,7 +283,7 @@ BENT_TAG = [
     [(6, 1.2, 0.0, ""), (6, 1.2, 3.0, "left camera"), (0, 3.0, 0.0, "at marker 6")],
 )
 def test_a_tag_that_is_off_by_less_than_a_pixel_in_one_posture_is_no_fault(arm, seed, off, shift, changed):
-    """One view does not tell a slanted tag from one that moved by as little; it hides no camera that moved."""
+    """One view does not tell a slanted tag from one that moved by as little, which hides no moved camera."""
     sharp, q = dataclasses.replace(arm.calibration, sigma_px=0.1), arm.way(seed)[0][-1]
     s = noisy(arm.images(at_once(q[None])), seed, 0.1)[0]
     s[:, 4:8] += off * np.array(BENT_TAG)
