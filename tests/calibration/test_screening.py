@@ -52,6 +52,7 @@ def filled(u, v):
         (-999.0, None, "u = -999 stands in"),
         (None, 65535.0, "v = 65535 stands in"),
         ((9999.0, -1.0), (9999.0, -1e9), "u = 9999, v = 9999 stands in"),
+        ((-999.0, 9999.0), None, "u = -999 stands in"),
     ],
 )
 def test_a_placeholder_counts_as_an_empty_cell(without, u, v, words):

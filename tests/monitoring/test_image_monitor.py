@@ -325,6 +325,22 @@ def test_in_one_posture_links_that_flex_are_said_beside_cameras_that_moved_alike
     assert "flex" not in large
 
 
+def test_looks_in_which_a_hand_comes_and_goes_are_not_kept(arm):
+    """It hides three markers of a view, then all but three, and three again; pulled corners hardly show."""
+    q, _ = arm.way(3)
+    q = q[:: len(q) // 24][:24]
+    s = noisy(arm.images(at_once(q)), 3)
+    s[8:12, 1, :3] = s[16:18, 1, :3] = np.nan
+    s[12:16, 1, :7] = np.nan
+    test, views = ImageMonitor(arm.calibration, SIGMA, LOOKS), []
+    for k in range(len(q)):
+        look(test, k, q[k], s[k])
+        views.append(test._detector.memory.state.views)
+    assert views[7] < views[11]
+    assert views[12] == views[17] == views[7]
+    assert views[-1] > views[17]
+
+
 @pytest.mark.parametrize(
     ("unanswered", "name"), [(3.0, "the reading of joint 2 stands still"), (0.5, "joint 2 slipped by")]
 )
