@@ -1,8 +1,11 @@
 """Faults that are none: what the study of monitoring, with errors of corners as measured, found once."""
 
+import numpy as np
 import pytest
 
-from tests.studies.monitoring import Rig, driven
+from projservo_cli.monitoring.image_monitor import detected_fault
+from tests.monitoring.stand_in import IMAGE, StandIn
+from tests.studies.monitoring import Rig, calibrated, driven, tasks
 
 
 @pytest.mark.parametrize(
@@ -14,3 +17,20 @@ def test_what_has_passed_is_no_fault(rig, number, level):
     # Windows show it all along; images since then agree, and no cause explains them better than none.
     (row,) = driven((rig, [("sound", number, level)]))
     assert row["verdict"] == "converged", row["reason"]
+
+
+@pytest.mark.parametrize(
+    ("bent", "shift", "named"),
+    [((), 0.0, ""), ((1, 4), 0.0, ""), ((1, 4), 3.0, "left camera"), ((0, 1, 4), 0.0, "marker")],
+)
+def test_tags_that_are_bent_in_one_posture_are_no_fault_and_hide_no_camera(bent, shift, named):
+    # Corners of a slanted tag that are off by up to 0.8 px, as a detector of sharp images has them.
+    rig = Rig("five", "finder", 0.0, 0.0)
+    goal = next(tasks(rig, np.random.default_rng(1)))[1]
+    robot, size = StandIn(**rig.options(at_deg=goal, seed=2)), np.array(IMAGE, dtype=float)
+    q, s = robot.read()[:2]
+    for tag in bent:
+        s[:, 4 * tag : 4 * tag + 4] += [[-0.15, 0.2], [-0.4, 0.1], [0.6, -0.5], [0.5, 0.15]]
+    s[0] += shift
+    fault = detected_fault(calibrated(rig), q, np.arange(20), s, size)
+    assert named in fault if named else fault == ""
