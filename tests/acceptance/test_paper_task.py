@@ -1,4 +1,4 @@
-"""The paper's 180° task on both six-joint arms: two calibrations at 0.5 px each, and the true operators."""
+"""The paper's 180° task on both six-joint arms: a calibration at 0.5 px each, and the true operators."""
 
 from functools import lru_cache
 
@@ -9,24 +9,22 @@ from tests.configured import calibrate, plan, servo
 from tests.known import configured, driven, known_scenario, planned
 
 ARMS = ("paper", "ur5")
-SEEDS = range(2)
 PER_STEP = (0.5, 0.1, 0.02)
 
 pytestmark = pytest.mark.volume
 
 
-@lru_cache(maxsize=64)
-def calibrated(arm, seed):
-    config = configured(arm, f"seed={seed}")
+@lru_cache
+def calibrated(arm):
+    config = configured(arm, "seed=1")
     _, calibration, _ = calibrate.run(config)
     return calibration, plan.run(config, calibration)
 
 
 @pytest.mark.parametrize("law", ["direct_three", "direct_two"])
 @pytest.mark.parametrize("arm", ARMS)
-@pytest.mark.parametrize("seed", SEEDS)
-def test_direct_laws_converge_without_occlusion(arm, seed, law):
-    trace = servo.run(configured(arm, f"seed={seed}"), *calibrated(arm, seed), law)
+def test_direct_laws_converge_without_occlusion(arm, law):
+    trace = servo.run(configured(arm, "seed=1"), *calibrated(arm), law)
     assert trace.verdict == "converged", trace.reason
     assert not trace.self_occluded.any()
     assert trace.position_error_mm < 0.1
@@ -56,6 +54,6 @@ def test_drift_falls_with_the_gain_and_with_the_limit(arm, law):
 def test_the_calibration_alone_sets_how_far_the_exact_law_strays(arm, gain):
     """Half a pixel of noise in the trials: what is left comes from the calibration alone."""
     gains = [f"control.gain_{part}={gain / 0.04}" for part in "ts"]
-    trace = servo.run(configured(arm, "seed=1", *gains), *calibrated(arm, 1), "exact")
+    trace = servo.run(configured(arm, "seed=1", *gains), *calibrated(arm), "exact")
     assert trace.verdict == "converged"
     assert trace.center_deviation_mm <= 1.2

@@ -49,7 +49,7 @@ def test_case_15_sentinel_9999(case, answer):
     assert "u = 9999, v = 9999" in err
 
 
-def test_case_01_joint_order(case, answer):
+def test_case_01_joint_order(case, answer, tmp_path):
     folder = case("01_joint_order")
     code, found, _ = answer("calibrate", "--data", folder / "trials.csv", "-o", "a")
     assert (code, found["usable"], found["order_determined"]) == (0, True, False)
@@ -58,18 +58,9 @@ def test_case_01_joint_order(case, answer):
         "the order of joints 1, 2, 3, 4, 5 and 6 is taken from the table; no pose"
     )
     # With the poses in which several move, the exchanged columns show.
-    lines = [
-        *(folder / "trials.csv").read_text(encoding="utf-8").splitlines(),
-        *(
-            f"{500 + int(pose)},{rest}"
-            for pose, rest in (
-                line.split(",", 1)
-                for line in (folder / "held.csv").read_text(encoding="utf-8").splitlines()[101:]
-            )
-        ),
-    ]
-    with open("both.csv", "w", encoding="utf-8") as file:
-        file.write("\n".join(lines) + "\n")
+    trials, held = ((folder / name).read_text(encoding="utf-8") for name in ("trials.csv", "held.csv"))
+    combined = "\n".join(f"500{line}" for line in held.splitlines()[101:])
+    (tmp_path / "both.csv").write_text(f"{trials.rstrip()}\n{combined}\n", encoding="utf-8")
     code, failed, _ = answer("calibrate", "--data", "both.csv", "-o", "b")
     assert code == 1
     assert "joint" in failed["reason"]

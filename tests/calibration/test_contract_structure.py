@@ -13,10 +13,10 @@ from tests.calibration.simulated_robot import around, random_robot, trials
 EXACT = 1e-12
 
 
-@pytest.fixture(scope="module", params=["RRRRRR", "RRPRPR"])
-def case(request):
+@pytest.fixture(scope="module")
+def case():
     rng = np.random.default_rng(11)
-    robot = random_robot(request.param, rng)
+    robot = random_robot("RRPRPR", rng)
     observation = robot.observe(trials(robot), 0.5, rng)
     calibration = calibrate(observation, robot.joint_types, sigma_px=0.5)
     return robot, observation, around(robot, 30, rng), calibration
@@ -37,15 +37,12 @@ def blocks(calibration):
 
 def common_form(B):
     """Symmetric Q (3, 3) with Bᵀ Q + Q B = 0 for all blocks, and the singular values of its equations."""
-    basis = []
-    for i in range(3):
-        for j in range(i, 3):
-            E = np.zeros((3, 3))
-            E[i, j] = E[j, i] = 1.0
-            basis.append(E)
+    basis = np.zeros((6, 3, 3))
+    for E, i, j in zip(basis, *np.triu_indices(3), strict=True):
+        E[i, j] = E[j, i] = 1.0
     rows = np.array([np.concatenate([(b.T @ E + E @ b).ravel() for b in B]) for E in basis]).T
     _, s, Vt = np.linalg.svd(rows)
-    Q = np.tensordot(Vt[-1], np.array(basis), axes=1)
+    Q = np.tensordot(Vt[-1], basis, axes=1)
     return Q * np.sign(np.trace(Q)), s
 
 
@@ -89,9 +86,9 @@ def test_operators_are_conjugate_to_rigid_motions_by_one_matrix(case):
     assert s[-2] > 1e-4 * s[0]  # nothing else is kept by all of them
     values = np.linalg.eigvalsh(Q)
     assert values[0] > 1e-4 * values[2]
-    if (~turns).sum() > 1:  # translations of one metre each are equally long in the common metric
-        speed = np.sqrt(np.einsum("ia,ab,ib->i", v[~turns], Q, v[~turns]))
-        np.testing.assert_allclose(speed, speed[0], rtol=1e-11)
+    # Translations of one metre each are equally long in the common metric.
+    speed = np.sqrt(np.einsum("ia,ab,ib->i", v[~turns], Q, v[~turns]))
+    np.testing.assert_allclose(speed, speed[0], rtol=1e-11)
     model = calibration.model()
     for row in q:
         H = frame @ forward_kinematics(model, row) @ np.linalg.inv(frame)

@@ -50,15 +50,8 @@ def test_noise_of_joints_is_told_from_that_of_pixels_with_an_interval_that_holds
 def test_the_fit_is_that_of_least_squares_over_robot_and_joints_at_once():
     """Beside a model of its own, with all true joints as parameters, and dense covariances."""
     robot, q, seen = recorded(3, markers=4)
-    held = []
-    found = calibrate(
-        seen,
-        TYPES,
-        joint_noise=SIGMA_Q,
-        sigma_px=SIGMA,
-        source="simulated",
-        fitted=lambda s, _: held.append(s),
-    )
+    held, given = [], {"joint_noise": SIGMA_Q, "sigma_px": SIGMA, "source": "simulated"}
+    found = calibrate(seen, TYPES, fitted=lambda s, _: held.append(s), **given)
     x, shape = parameters(robot), q.shape
     scale = np.concatenate([np.maximum(np.abs(x), 1e-2), np.full(q.size, 1e-3)])
 

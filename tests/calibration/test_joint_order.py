@@ -1,6 +1,7 @@
 """Which order of joints along the arm the poses show."""
 
 import dataclasses
+import itertools
 
 import numpy as np
 import pytest
@@ -8,15 +9,11 @@ import pytest
 from projservo_cli import Observations, calibrate
 from tests.calibration.simulated_robot import around, random_robot, trials
 
-COMMUTING = {("P", "P")}
-
 
 def pairs(types):
-    """All pairs of joints whose order matters."""
-    n = len(types)
-    return [
-        [i + 1, j + 1] for i in range(n) for j in range(i + 1, n) if (types[i], types[j]) not in COMMUTING
-    ]
+    """All pairs of joints whose order matters: two that slide commute."""
+    numbers = itertools.combinations(range(1, len(types) + 1), 2)
+    return [[i, j] for i, j in numbers if types[i - 1] + types[j - 1] != "PP"]
 
 
 def seen(robot, q, sigma=0.3):
@@ -27,13 +24,12 @@ def seen(robot, q, sigma=0.3):
 def undecided(observations):
     found = calibrate(observations, progress=False)
     assert found.usable
-    assert (
-        bool(found.undecided_order.size) == bool(found.order_advice) == (found.order_advice in found.advice)
-    )
+    told = found.order_advice in found.advice
+    assert bool(found.undecided_order.size) == bool(found.order_advice) == told
     return found.undecided_order.tolist(), found
 
 
-@pytest.mark.parametrize("types", ["RRRR", "RPRPR", "RRP"])
+@pytest.mark.parametrize("types", ["RRR", "RPRP"])
 def test_single_joint_trials_show_no_order_and_combined_poses_all_of_it(types):
     robot = random_robot(types, np.random.default_rng(4), markers=8)
     single, several = trials(robot, 8), around(robot, 4, np.random.default_rng(5))

@@ -22,7 +22,7 @@ def lensed(straight, lens):
 
 @pytest.fixture(scope="module")
 def robot():
-    return random_robot("RRPRRR", np.random.default_rng(30))
+    return random_robot("RRPR", np.random.default_rng(30))
 
 
 @pytest.fixture(scope="module")

@@ -65,9 +65,9 @@ def test_a_marker_whose_readings_are_all_wrong_costs_that_marker_alone(lost):
 
 def test_sightings_left_out_that_agree_on_other_joints_are_told():
     """A third of the points of each pose is where the poses before show it, and all slip a little."""
-    mistaken = table("right", 1, 40, 30, joint_types="RR", sigma=0.2, slip=0.25, length=30)
+    mistaken = table("right", 1, 30, 20, joint_types="RR", sigma=0.2, slip=0.25, length=30)
     images = mistaken.observation.images.copy()
-    late = np.random.default_rng(0).random((30, 40)) < 0.3
+    late = np.random.default_rng(0).random((20, 30)) < 0.3
     late[0] = False
     for k, j in np.argwhere(late):
         images[k, :, j] = mistaken.observation.images[k - 1, :, j]

@@ -23,7 +23,7 @@ from tests.studies.refit import knocked
 
 SIGMA = 0.4
 LENS = np.array([640.0, 512.0, 640.0, -0.12, 0.03])
-RIGS = [("RRRRRR", 2, "world"), ("RRPRR", 3, "world"), ("RRRRR", 1, "world"), ("RRPRR", 2, "tool")]
+RIGS = [("RRPRR", 3, "world"), ("RRRRR", 1, "world"), ("RRPRR", 2, "tool")]
 
 
 @pytest.fixture(scope="module", params=RIGS, ids=str)

@@ -14,10 +14,9 @@ from projservo_cli.settings.markers import Markers
 CAMERA = np.array([[600.0, 0.0, 322.0], [0.0, 604.0, 236.0], [0.0, 0.0, 1.0]])
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_poses_that_show_one_tag_alone_do_not_mislead_the_fit(seed):
+def test_poses_that_show_one_tag_alone_do_not_mislead_the_fit():
     """Tags nearly in a plane, half a metre away, as before a camera on the hand."""
-    rng, sigma_px = np.random.default_rng(seed), 0.01
+    rng, sigma_px = np.random.default_rng(0), 0.01
     points = Markers.model_validate({"tags": "roof"}).points
     facing = Rotation.from_rotvec([np.pi, 0.0, 0.0])
     turns = (Rotation.from_euler("xyz", rng.uniform(-0.35, 0.35, (36, 3))) * facing).as_rotvec()

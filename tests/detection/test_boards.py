@@ -27,14 +27,11 @@ def picture(board):
     if board.kind == "charuco":
         printed = cv2.aruco.CharucoBoard((board.columns, board.rows), 1.0, 0.7, DICTIONARY)
         size = [CELL * (n + 2) for n in (board.columns, board.rows)]
-        grey, first = printed.generateImage(size, marginSize=CELL), 2
+        grey = printed.generateImage(size, marginSize=CELL)
     else:
         squares = np.indices((board.rows + 1, board.columns + 1)).sum(axis=0) % 2
-        grey = np.pad(np.kron(255 * squares, np.ones((CELL, CELL))), CELL, constant_values=255).astype(
-            np.uint8
-        )
-        first = 2
-    return grey, CELL * (board.places + first) - 0.5
+        grey = np.pad(np.kron(255 * squares, np.ones((CELL, CELL))), CELL, constant_values=255)
+    return grey.astype(np.uint8), CELL * (board.places + 2) - 0.5
 
 
 def drawn(board, H, blur, noise, rng, size=SIZE):
@@ -96,10 +93,7 @@ def test_a_covered_corner_is_rejected_and_a_small_board_is_less_certain(rng):
     u, v = np.rint(true[7]).astype(int)
     image[v - 3 : v + 12, u - 3 : u + 12] = 128
     corners = BoardFinder(board, "4X4_250").find(image.astype(float))[0][0]
-    assert (
-        not np.isfinite(corners.sigma[7])
-        or np.linalg.norm(corners.pixels[7] - true[7]) < 4 * corners.sigma[7]
-    )
+    assert not np.linalg.norm(corners.pixels[7] - true[7]) >= 4 * corners.sigma[7]  # which may be unknown
     assert np.isfinite(corners.sigma).sum() > 20
 
 
@@ -113,7 +107,7 @@ def test_images_of_a_symmetric_board_calibrate_a_robot(projservo, monkeypatch, t
     twists = np.array([revolute((0.1, 0.0, 0.0), (0.1, 0.2, 1.0)), *arm["twists"][1:]])
     half = np.diag([0.5, 0.5, 1.0]) @ arm["cameras"]
     arm = Robot(**(arm | {"markers": body, "twists": twists, "cameras": half}))
-    q = around(arm, 14, rng, angle=0.4)
+    q = around(arm, 11, rng, angle=0.4)
     q[:, 0] += np.linspace(-1.2, 1.6, len(q))
     for k, row in enumerate(arm.images(q)):
         for side, pixels in zip(("left", "right"), row, strict=True):
@@ -166,11 +160,11 @@ cameras: {{left: {{source: "{left}"}}, right: {{source: "{right}"}}, max_age_s: 
 markers: {{board: {{kind: charuco, rows: 4, columns: 5, size_m: 0.14, dictionary: 4X4_250}}}}
 robot: {{limits: {{joints: [[-2, 2], [-2, 2]], unit: rad}}}}
 calibration:
-  {{reference: {{joints: {q}, unit: rad}}, frames_per_joint: 2, amplitude_deg: 20, random_poses: 4}}
+  {{reference: {{joints: {q}, unit: rad}}, frames_per_joint: 2, amplitude_deg: 20, random_poses: 2}}
 control: {{joint_speed_limit_deg_s: 600}}
 """
 TOLD = {
-    "record": "9 poses recorded",
+    "record": "7 poses recorded",
     "calibrate": "calibrate: usable",
     "teach --frames 3": "markers that disagree with the calibration: none",
     "doctor": "agrees with the images",

@@ -61,7 +61,7 @@ def test_corners_are_found_to_a_fraction_of_a_pixel(rng, name):
 
 def test_corners_err_as_they_say():
     """By decade; tags of all sizes and tilts, sharp and blurred."""
-    found = errors(24)
+    found = errors(16)
     assert np.abs(found.error[found.clean].mean(axis=0)).max() < 0.03
     decades = list(found.by_decade())
     assert len(decades) >= 2

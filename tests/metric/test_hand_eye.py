@@ -76,14 +76,14 @@ def camera_frame(P):
     return T
 
 
-@pytest.fixture(scope="module", params=["pair", "one"])
-def recorded(request, tmp_path_factory):
-    """A rig, the run of its recording from the command line, and a URDF of the true arm."""
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """A pair of cameras, the run of its recording from the command line, and a URDF of the true arm."""
     folder = tmp_path_factory.mktemp("hand")
-    hand.write_recording(request.param, folder)
+    hand.write_recording("pair", folder)
     told = ["--mount", "tool", "--image-size", "1280x1024", "--joints", "RRRRRR"]
     assert run(["calibrate", "--data", str(folder / "hand.csv"), *told, "-o", str(folder / "run")]) == 0
-    return hand.RIGS[request.param], folder
+    return hand.RIGS["pair"], folder
 
 
 def export(folder, kind, *more):
@@ -108,7 +108,7 @@ def test_files_of_others_have_the_true_hand_eye_transformation(recorded):
     file = cv2.FileStorage(str(export(folder, "opencv", *model)), cv2.FILE_STORAGE_READ)
     ros = ElementTree.parse(export(folder, "ros", *model)).getroot()
     names = [node.get("args").split() for node in ros]
-    for v, view in enumerate(("left", "right")[: len(eyes)]):
+    for v, view in enumerate(("left", "right")):
         R, t = (file.getNode(f"{view}_{part}_cam2gripper").mat() for part in "Rt")
         # Without skew it is another estimate, by what the noise allows.
         np.testing.assert_allclose(t.ravel(), poses[v, :3, 3], atol=1e-3)
@@ -121,7 +121,7 @@ def test_files_of_others_have_the_true_hand_eye_transformation(recorded):
 
 
 def test_positions_of_the_flange_are_those_of_the_arm(recorded, capsys):
-    """Of a point of it, as a laser tracker would measure them, also with one camera."""
+    """Of a point of it, as a laser tracker would measure them."""
     _, folder = recorded
     q = hand.readings()
     xyz = [(hand.flange(row) @ [0.02, 0.05, 0.1, 1.0])[:3] for row in q]

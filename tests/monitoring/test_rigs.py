@@ -1,4 +1,4 @@
-"""Faults of rigs of one and three cameras of any names, fixed or on the tool: what is named, how often."""
+"""Faults of rigs of one to three cameras of any names, fixed or on the tool: what is named, how often."""
 
 import dataclasses
 import re
@@ -18,7 +18,7 @@ from tests.calibration.simulated_robot import around, random_robot, revolute, tr
 from tests.calibration.test_cameras_on_the_tool import Hand
 from tests.monitoring.test_image_monitor import LOOKS, PERIOD, Arm, first_alarm, look, noisy
 
-RIGS = [(1, "world"), (3, "world"), (1, "tool")]
+RIGS = [(1, "world"), (2, "world"), (3, "world"), (1, "tool")]
 TYPES, NAMES, ONSET = "RRPRR", ("wrist", "top", "low"), 15
 NOISE = np.array([0.5, 0.5, 1.0])  # of each view, px
 
@@ -93,7 +93,7 @@ def test_a_joint_that_slips_is_named_as_a_joint(case, joint):
 def test_a_joint_of_the_other_sign_that_puts_all_markers_behind_the_camera_explains_nothing():
     """The camera stands on the axis of the first joint, whose readings are near a quarter of a turn."""
     rng = np.random.default_rng(3)
-    robot = random_robot("RRRRR", rng, markers=8, views=1)
+    robot = random_robot("RRR", rng, markers=8, views=1)
     center = np.linalg.svd(robot.cameras[0])[2][-1]
     center = center[:3] / center[3]  # it looks at the origin
     robot.twists[0] = revolute(center, np.cross(center, rng.standard_normal(3)))
@@ -228,15 +228,21 @@ def test_residuals_of_the_model_itself_are_no_fault_more_often_than_stated(case,
     """Errors of calibration, joints and instants of the first order; a chance of one run in five."""
     runs, alarms, c = 8, 0, dataclasses.replace(case.calibration, sigma_q=1e-3)
     monkeypatch.setattr(innovation_tests, "_FALSE_ALARM", 0.2)
+    q_dot = np.gradient(case.q, axis=0) / PERIOD
     params, away = prediction.parameters_from(c), prediction.from_reference(c, case.q)
     J = prediction.dense_pixel_changes(params, prediction.errors_of(c), away)
     off = params.predict(away) - case.robot.images(case.q)
     for seed in range(runs):
         rng = np.random.default_rng(seed)
-        s = off + case.robot.images(case.q + 1e-3 * rng.standard_normal(case.q.shape))
+        joint = rng.standard_normal(case.q.shape) + rng.standard_normal(case.q.shape[1])
+        s, true = off.copy(), case.q + 1e-3 * joint / np.sqrt(2.0)
+        for v in range(len(case.views)):
+            late = 0.005 * rng.standard_normal((len(true), 1))
+            s[:, v] += case.robot.images(true + late * q_dot)[:, v]
         s += J @ rng.standard_normal(J.shape[-1])
         s = noisy(s, seed, NOISE[: len(case.views), None, None])
-        alarms += case._replace(calibration=c).said(case.q, s)[0] is not None
+        arm = Arm(c, None, None, None)
+        alarms += first_alarm(arm, case.q, s, q_dot, 0.005, sigma=c.sigma_px)[0] is not None
     assert alarms <= 0.2 * runs
 
 
@@ -258,7 +264,7 @@ def test_goal_images_fit_a_pose_of_the_body_and_a_shifted_one_is_named(case):
     assert np.linalg.norm(moved) == pytest.approx(0.1, rel=0.1)
 
 
-@pytest.mark.parametrize("views", [1, 2, 3, 4])
+@pytest.mark.parametrize("views", [1, 2, 4])
 def test_every_frame_is_of_one_observation_in_the_order_of_time(views):
     rng, pairing, seen = np.random.default_rng(views), Pairing(views), []
     t = np.sort(rng.uniform(0.0, 4.0, (views, 90)), axis=1)
