@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -15,14 +16,15 @@ from tests.robots.robots import CALLS, Seeing, Sound
 CONFIG = Path(__file__).parents[2] / "configs" / "object.yaml"
 PART = load_config(CONFIG).objects.named["part"]
 OPTIONS = f"options: {{config: {CONFIG}}}, averaged_frames: 10"
+REGULATED = ("--set", "control.mode=[regulate]", "--set", "control.gain=8")
 PLANT = f"plant={{use: 'tests.robots.robots:Seeing', {OPTIONS}}}"
 
 
 @pytest.fixture(scope="module")
-def taught(tmp_path_factory):
+def taught(calibrated_run, tmp_path_factory):
     """A folder with a calibrated run, and a goal that was taught with the part where it was."""
     folder = tmp_path_factory.mktemp("taught")
-    assert cli.run(["calibrate", "-c", str(CONFIG), "-o", str(folder / "run"), "-q"]) == 0
+    shutil.copytree(calibrated_run("object"), folder / "run")
     goal = ["--set", "task.goal={taught: goal.yaml, on: part}"]  # still to be taught
     arguments = ["-c", str(CONFIG), "--set", PLANT, *goal, "-o", str(folder / "goal.yaml"), "-q"]
     assert cli.run(["teach", str(folder / "run"), *arguments]) == 0
@@ -39,7 +41,7 @@ def call(taught, projservo, monkeypatch):
             monkeypatch.setattr(Seeing, name, value)
         monkeypatch.setattr(Seeing, "looks", 0)
         goal = f"task.goal={{taught: {taught / 'goal.yaml'}, on: part}}"
-        given = ("-c", CONFIG, "-o", taught / "run", "--set", PLANT, "--set", goal)
+        given = ("-c", CONFIG, "-o", taught / "run", *REGULATED, "--set", PLANT, "--set", goal)
         return projservo(*arguments, *given)
 
     return called
@@ -65,7 +67,7 @@ def test_a_sequence_looks_at_its_object_over_the_connection_that_drives(call, ta
     features = {"plate": {"on": "tool", "plane": [0, 1, 2]}}
     asked = [f"--set=task.steps={json.dumps(steps)}", f"--set=features={json.dumps(features)}"]
     CALLS.clear()
-    answer = call("servo", "--law", "exact", "--set=control.mode=[regulate]", *asked, "--json")
+    answer = call("servo", "--law", "exact", *asked, "--json")
     assert answer.code == 0, answer.err
     assert [step["name"] for step in answer.json["steps"]] == ["approach_goal", "goal", "retreat"]
     assert [CALLS.count(name) for name in ("open", "stop", "close")] == [1, 1, 1]
@@ -134,7 +136,7 @@ def test_a_simulated_object_that_is_pushed_ends_the_run_likewise(projservo, taug
     pushed = "disturbance.object_moved={at_step: 20, name: %s, translation_m: [0, 0.02, 0]}"
     command = ("servo", "-c", CONFIG, "-o", taught / "run", "--law", "exact", "--set")
     assert "there is no object prt with places" in projservo(*command, pushed % "prt").err
-    answer = projservo(*command, pushed % "part", "--set", "control.mode=[regulate]")
+    answer = projservo(*command, pushed % "part", *REGULATED[:2])
     assert answer.code == 1
     trace = load(taught / "run").traces["exact"]
     assert trace.verdict == "object moved"
