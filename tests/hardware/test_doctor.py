@@ -266,7 +266,7 @@ def test_motions_of_a_sound_arm_tell_latency_hysteresis_and_backlash():
     [
         (
             Faults(link=3),
-            (2, 3, 4),
+            range(5),
             "joints 4, 5",
             "no tag moved: the tags sit on the link before joint 4: mount them behind",
         ),

@@ -12,7 +12,7 @@ from projservo_cli.config import to_yaml
 from projservo_cli.records import InputError
 from tests.simulation.conftest import eyes_of
 
-POSTURES = np.array([[0.1 * a, 0.25 * b] for a in (-2, 1, 3) for b in (-2, 0, 1)])
+POSTURES = np.array([[0.1 * a, 0.25 * b] for a in (-2, 0, 1, 3) for b in (-1, 0, 1)])
 
 
 def misses(truth, eyes, postures, seed=0):

@@ -13,7 +13,6 @@ from projservo_cli.config import load_config
 from projservo_cli.experiment import Experiment
 from projservo_cli.records import InputError
 from projservo_cli.settings.task import TaskSettings
-from projservo_cli.stages import servo
 from projservo_cli.store import load
 from tests.configured import draw_only, truth_of
 from tests.conftest import ROOT
@@ -125,21 +124,6 @@ def test_the_first_step_that_fails_stops_and_says_what_is_held(call):
     assert "the gripper stays at 0.3; wait was not begun; the sequence begins again at its first" in line
     assert "ended in max steps" in line
     assert "servo/wait" not in load("run").results
-
-
-def test_an_interrupt_says_what_is_held(call, monkeypatch):
-    drive = servo.run
-
-    def interrupted(inputs, calibration, plan, name, **brought):
-        if inputs.plan.displaced is not None and inputs.plan.displaced.of_start:
-            raise KeyboardInterrupt
-        return drive(inputs, calibration, plan, name, **brought)
-
-    monkeypatch.setattr(servo, "run", interrupted)
-    answer = call(steps=[STEPS[2], STEPS[3], STEPS[5]])
-    assert answer.code == 130
-    said = " ".join(answer.err.split())
-    assert "servo/retreat/exact_track: interrupted; the gripper stays at 0.3; the sequence begins" in said
 
 
 @pytest.mark.parametrize(
