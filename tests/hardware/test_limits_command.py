@@ -116,12 +116,17 @@ def test_all_that_answer_are_released_and_the_others_named(arm, capsys):
     assert [i for i, servo in arm.bus.servos.items() if servo.on] == [2, 6]
 
 
-def test_limits_that_a_servo_stores_are_named_where_they_cut(arm, capsys):
-    arm.bus.servos[2].put(9, 2, 2500)
+@pytest.mark.parametrize(
+    ("registers", "said"),
+    [((0, 0), "stores limits of its own, 0 to 0 counts"), ((2500, 4095), "2500 to 4095")],
+)
+def test_limits_that_a_servo_stores_are_named_where_they_cut(arm, capsys, registers, said):
+    for address, value in zip((9, 11), registers, strict=True):
+        arm.bus.servos[2].put(address, 2, value)
     arm.script += [lambda: "\n", moved(arm.bus, [(-15.0, 15.0)] * 5)]
     before = arm.file.read_text()
     assert run(["limits", "-c", "arm.yaml"]) == 1
-    assert "stores limits of its own, 2500 to 4095 counts" in capsys.readouterr().err
+    assert said in capsys.readouterr().err
     assert arm.file.read_text() == before
 
 

@@ -26,7 +26,7 @@ IN_HOLE = {
 STEPS = [
     {"act": {"gripper": 1.0}},
     {"approach": {"along": "pin", "by_m": 0.05, "to": "in_hole"}},
-    {"to": "in_hole", "duration_s": 4.0},
+    {"to": "in_hole", "duration_s": 2.5},
     {"act": {"gripper": 0.3}},
     {"wait_s": 0.5},
     {"retreat": {"along": "pin", "by_px": 40.0}},
@@ -80,7 +80,7 @@ def test_a_pin_is_brought_before_its_hole_goes_in_and_comes_out_along_it(call, m
         f"servo/{name}{'/exact_track' * (name in MOTIONS)}" for name in names
     ]
     durations = [run.at_step(name).plan.duration for name in MOTIONS]
-    assert durations[1] == pytest.approx(4.0)
+    assert durations[1] == pytest.approx(2.5)
     assert max(durations[::2]) < 2.0  # none is given
     truth = truth_of(load_config(PUMA))
     before, inside, after = (pin(trace, truth) for trace in run.traces.values())
