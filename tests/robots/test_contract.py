@@ -124,7 +124,7 @@ def test_a_command_expires(robot, steered):
     np.testing.assert_allclose(where(robot), gone, atol=1e-6)
 
 
-def test_time_passes_in_commands_alone(robot, steered):
+def test_time_passes_in_commands_alone(steered):
     before = steered.robot.now()
     steered.observe()
     assert steered.robot.now() == before

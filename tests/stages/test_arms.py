@@ -76,7 +76,7 @@ def planned(name, *overrides):
 
 
 @pytest.mark.volume
-@pytest.mark.parametrize("law", ["exact", "stacked"])
+@pytest.mark.parametrize("law", ["exact", "direct_two", "stacked"])
 @pytest.mark.parametrize("name", ARMS)
 def test_the_task_is_done(name, law):
     config, calibration, found = planned(name)
