@@ -242,14 +242,6 @@ def test_a_law_that_fails_or_lacks_a_limit(servo, law, code, message):
     assert code == 1 or commands() == []
 
 
-def test_confirm_needs_a_terminal(servo, monkeypatch):
-    monkeypatch.setattr("sys.stdin", io.StringIO("y\n"))
-    answer = servo(*SOUND, "--confirm")
-    assert answer.code == 2
-    assert "--confirm: standard input is no terminal" in answer.err
-    assert commands() == []
-
-
 @pytest.mark.parametrize(("answered", "code"), [("y", 0), ("n", 130), ("", 130)])
 def test_confirm_asks_before_the_first_motion(servo, monkeypatch, answered, code):
     monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
@@ -266,6 +258,14 @@ def test_confirm_asks_before_the_first_motion(servo, monkeypatch, answered, code
     assert moved == 0
     assert ("servo will move tests.robots.robots:Sound, speeds times 0.5" in answer.err) or asked[0][0]
     assert bool(commands()) == (code == 0)
+
+
+def test_confirm_needs_a_terminal(servo, monkeypatch):
+    monkeypatch.setattr("sys.stdin", io.StringIO("y\n"))
+    answer = servo(*SOUND, "--confirm")
+    assert answer.code == 2
+    assert "--confirm: standard input is no terminal" in answer.err
+    assert commands() == []
 
 
 def test_a_report_never_moves_a_robot(servo, projservo):
