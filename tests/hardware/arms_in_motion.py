@@ -101,14 +101,14 @@ class Rail(Quiet):
         return self.q, s, self.time, *stamps
 
 
-def findings(faults, **given):
-    """Findings of the motions of all joints of such an arm."""
+def findings(faults, moving=range(5), **given):
+    """Findings of the motions of joints of such an arm."""
     config = load_config("configs/hobby.yaml", SETTINGS)
     joints, numbers = joints_of(config), recording_inputs(config).numbers
     robot = Wiggled(truth_of(config), faults, **given)
     foreign = PluginRobot(robot, "arm", len(numbers), bounds_of(config, joints), 30.0, 30.0)
     with at_rest_after(foreign):
         steered = Steered(foreign)
-        moved = [checks_in_motion.strokes(steered, joint) for joint in range(5)]
+        moved = [checks_in_motion.strokes(steered, joint) for joint in moving]
     sound = [one for one in moved if not isinstance(one, str)]
     return [*checks_in_motion.findings_of(sound, numbers)], moved

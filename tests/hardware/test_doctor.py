@@ -212,7 +212,7 @@ def test_a_calibrated_run_tells_what_changed_since(calibrated, change, words):
 @pytest.mark.parametrize(("views", "slipped"), [(2, False), (2, True), (3, False)])
 def test_a_camera_that_moved_is_named_with_the_poses_that_mend_it(calibrated, views, slipped):
     if views == 3:
-        calibrated = of_hobby(f"rig.top={json.dumps(TOP)}")
+        calibrated = of_hobby(f"rig.top={json.dumps(TOP)}", "calibration.frames_per_joint=4")
     q, off = calibrated.q_reference, np.zeros(len(calibrated.q_reference))
     off[1] = np.radians(3.0 * slipped)
     s = predict(calibrated, (q + off)[None])[0]
@@ -262,19 +262,20 @@ def test_motions_of_a_sound_arm_tell_latency_hysteresis_and_backlash():
 
 
 @pytest.mark.parametrize(
-    ("faults", "where", "words"),
+    ("faults", "moving", "where", "words"),
     [
         (
             Faults(link=3),
+            range(5),
             "joints 4, 5",
             "no tag moved: the tags sit on the link before joint 4: mount them behind",
         ),
-        (Faults(loose=3, loose_px=3.0), "tags", "tag 3 moved by"),
-        (Faults(held=1), "joint 2", "went 0 deg of 3 deg: it is held or too weak: free it"),
+        (Faults(loose=3, loose_px=3.0), (0, 2), "tags", "tag 3 moved by"),
+        (Faults(held=1), (1,), "joint 2", "went 0 deg of 3 deg: it is held or too weak: free it"),
     ],
 )
-def test_motions_name_what_a_recording_would_fail_at(faults, where, words):
-    found, _ = findings(faults)
+def test_motions_name_what_a_recording_would_fail_at(faults, moving, where, words):
+    found, _ = findings(faults, moving)
     (fault,) = (one for one in found if one.level == "fault")
     assert fault.where == where
     assert words in f"{fault.text}: {fault.remedy}"

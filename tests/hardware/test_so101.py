@@ -390,6 +390,7 @@ def test_what_the_gripper_cannot_do_is_named(opened, rig):
 def test_a_gripper_that_holds_keeps_its_grip(opened, rig):
     bus = rig()
     bus.servos[6].write(GOAL, (1000).to_bytes(2, "little"))
+    time.sleep(0.3)  # until it has closed: no joint may seem to leap
     arm = opened(bus)[1]
     before = len(bus.servos[6].moments)
     arm.hold()

@@ -31,7 +31,6 @@ def sides(corners):
     [
         ("single", 30, "4X4_50", "a4", 16),
         ("plate", 55, "APRILTAG_36H11", "letter", 4),
-        ("roof", 30, "4X4_50", "letter", 5),
         ("roof", 42, "5X5_100", "a4", 5),
     ],
 )

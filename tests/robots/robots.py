@@ -118,7 +118,7 @@ class Faulty(Sound):
             q = self.still
         if self.fault == "bumped camera":
             s[0] += [2.0, -2.5]
-        if self.fault == "lost" or (self.fault == "lost for a while" and self.count < self.after + 10):
+        if self.fault == "lost":
             s[:] = np.nan
         if self.fault == "blind":
             s[0] = np.nan
@@ -133,10 +133,7 @@ class Faulty(Sound):
         return q, s
 
     def command(self, target, speed, due):
-        before = self.q
         super().command(target, speed, due)
-        if self.wrong and self.fault == "blocked":
-            self.q = np.where(np.arange(len(before)) == 2, before, target)
         if self.wrong and self.fault == "command raises":
             raise RuntimeError("protective stop")
 

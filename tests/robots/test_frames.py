@@ -12,7 +12,7 @@ from projservo_cli.robots.frame_recorder import MOST_FRAMES, FrameRecorder
 from projservo_cli.store.run_file import load
 from tests.fake_records import fake
 from tests.robots.robots import Sound
-from tests.robots.test_servo import NEAR, OPTIONS
+from tests.robots.test_servo import OPTIONS, QUICK
 
 
 @pytest.mark.parametrize("looks", [1, 2, 59, 60, 61, 118, 1000])
@@ -51,7 +51,7 @@ class Seeing(Sound):
 
 def test_the_frames_of_a_run_show_what_was_found_in_them(servo):
     seeing = f"plant={{use: '{__name__}:Seeing', {OPTIONS}}}}}"
-    assert servo("--set", seeing, *NEAR, "-q").code == 0
+    assert servo("--set", seeing, *QUICK, "-q").code == 0
     trace = load("run").traces["direct_three"]
     assert trace.frame_index[0] == 0
     assert trace.frame_index[-1] == trace.steps

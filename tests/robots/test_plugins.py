@@ -122,7 +122,7 @@ class Law:
 
 def test_a_law_that_is_edited_is_run_anew_and_one_that_is_gone_stands(projservo):
     written("mine_edited", LAW)
-    command = ("servo", "-c", UR5, "--law", "mine_edited:Law", "-o", "run")
+    command = ("servo", "-c", UR5, "--law", "mine_edited:Law", "-o", "run", "--set", "stop.max_steps=2")
 
     def said():
         return projservo(*command, "--dry-run").out

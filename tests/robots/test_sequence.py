@@ -43,7 +43,14 @@ def asked(robot="Gripping", options="", **task):
     task = {"start": "current", "goals": GOALS, "steps": STEPS} | task
     values = {"features": FEATURES, "task": task}
     plant = f"plant={{use: '{HERE}:{robot}', {OPTIONS}{options}}}}}"
-    return ["--set", plant, *(f"--set={key}={json.dumps(value)}" for key, value in values.items()), "--json"]
+    return [
+        "--set",
+        plant,
+        "--set",
+        "control.gain=8",
+        *(f"--set={key}={json.dumps(value)}" for key, value in values.items()),
+        "--json",
+    ]
 
 
 def once(name):

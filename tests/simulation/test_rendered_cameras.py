@@ -12,7 +12,7 @@ from projservo_cli.config import to_yaml
 from projservo_cli.records import InputError
 from tests.simulation.conftest import eyes_of
 
-POSTURES = np.array([[0.1 * a, 0.25 * b] for a in (-2, 0, 1, 3) for b in (-2, -1, 0, 1, 2)])
+POSTURES = np.array([[0.1 * a, 0.25 * b] for a in (-2, 0, 1, 3) for b in (-1, 0, 1)])
 
 
 def misses(truth, eyes, postures, seed=0):
@@ -52,8 +52,10 @@ HASHED = """
 import hashlib, sys
 import numpy as np
 from projservo_cli.config import load_config
-from tests.configured import eyes_of
-eyes = eyes_of(load_config("small.yaml", ["plant.options={k1: -0.1}"], text=sys.stdin.read()))
+from projservo_cli.config.inputs import scene_of
+from projservo_cli.simulation.rendering import Frames, rendered_model
+config = load_config("small.yaml", ["plant.options={k1: -0.1}"], text=sys.stdin.read())
+eyes = Frames(rendered_model(scene_of(config)))
 eyes.open()
 seen = [eyes.capture(view, np.array([[0.1, 0.2]]), None, np.random.default_rng(view))[0] for view in range(2)]
 print(hashlib.sha256(eyes.last.tobytes() + np.array(seen).tobytes()).hexdigest())
@@ -61,15 +63,9 @@ eyes.close()
 """
 
 
-@pytest.mark.parametrize("gl", ["egl", "osmesa"])
-def test_processes_draw_the_same_to_the_bit(small, drawn, gl):
-    config = small("plant.options={k1: -0.1}")
-    _, eyes = drawn(config)
-    seen = [
-        eyes.capture(view, np.array([[0.1, 0.2]]), None, np.random.default_rng(view))[0] for view in range(2)
-    ]
-    here = hashlib.sha256(eyes.last.tobytes() + np.array(seen).tobytes()).hexdigest()
-    there = subprocess.run(
+def drawn_elsewhere(config, gl):
+    """What another process prints that draws by OpenGL of a kind."""
+    return subprocess.run(
         [sys.executable, "-c", HASHED],
         input=to_yaml(config),
         env={**os.environ, "MUJOCO_GL": gl, "PYOPENGL_PLATFORM": gl},
@@ -77,21 +73,25 @@ def test_processes_draw_the_same_to_the_bit(small, drawn, gl):
         text=True,
         check=False,
     )
+
+
+def test_processes_draw_the_same_to_the_bit(small, drawn):
+    """By another kind of OpenGL where there is one."""
+    config = small("plant.options={k1: -0.1}")
+    _, eyes = drawn(config)
+    seen = [
+        eyes.capture(view, np.array([[0.1, 0.2]]), None, np.random.default_rng(view))[0] for view in range(2)
+    ]
+    here = hashlib.sha256(eyes.last.tobytes() + np.array(seen).tobytes()).hexdigest()
+    there = drawn_elsewhere(config, "osmesa")
     if "finds no OpenGL" in there.stderr:
-        pytest.skip(f"no OpenGL of the kind {gl} here")
+        there = drawn_elsewhere(config, "egl")
     assert there.stdout.strip() == here
 
 
 @pytest.mark.usefixtures("needs_mujoco")
 def test_what_lacks_gl_is_told_what_to_install(small):
-    done = subprocess.run(
-        [sys.executable, "-c", HASHED],
-        input=to_yaml(small()),
-        env={**os.environ, "MUJOCO_GL": "disable"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = drawn_elsewhere(small(), "disable")
     assert done.returncode == 1
     assert "InputError: MuJoCo finds no OpenGL to draw with: apt-get install libegl1" in done.stderr
 

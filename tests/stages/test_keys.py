@@ -31,6 +31,7 @@ CASES = {
     "faults": (
         "hobby",
         (
+            "calibration.random_poses=4",
             "disturbance.servo_time_constant_s=0.05",
             "disturbance.joint_moved={at_step: 4, joint: 1, by_deg: 2}",
         ),

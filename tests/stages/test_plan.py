@@ -59,10 +59,9 @@ def test_plan_does_not_depend_on_the_frame(name):
         assert there.tau_limit == pytest.approx(example.plan.tau_limit, rel=1e-8)
 
 
-@pytest.mark.parametrize("name", ["paper"])
-def test_the_planned_sense_of_a_half_turn_is_the_better(name):
+def test_the_planned_sense_of_a_half_turn_is_the_better():
     """Against the opposite sense: it stays within the joint limits, or arrives no later."""
-    example = case(name)
+    example = case("paper")
     planned = example.trace("direct_two")
     sense = example.plan.rotation_sense() * np.array([[1.0], [-1.0]])
     other = example.servo("direct_two", sense=sense)

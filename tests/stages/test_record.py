@@ -201,9 +201,7 @@ def test_every_step_keeps_the_speed_limit_and_the_joint_limits():
 
 
 REAL = {
-    "lag": {"lag": 0.15},
     "sag and play": {"sag": 0.00873, "play": 0.00873, "lag": 0.05},
-    "ticks": {"tick": 2 * np.pi / 4096, "lag": 0.05},
     "late": {"late": 0.3, "lag": 0.05},
     "webcam": {"late": 0.12, "lag": 0.15, "rate": 30.0, "noise": 0.5, "tick": 2 * np.pi / 4096},
 }

@@ -31,17 +31,6 @@ def test_trace_is_the_run_as_it_was():
     assert fastest[trace.speed_factor < 1] == pytest.approx(math.radians(125), rel=1e-12)
 
 
-@pytest.mark.parametrize("name", ["paper_perturbed", "stanford"])
-@pytest.mark.parametrize("law", ["direct_three", "direct_two"])
-def test_direct_laws_do_the_task_in_sight_of_both_cameras(name, law):
-    trace = case(name).trace(law)
-    assert trace.verdict == "converged"
-    assert (trace.self_occluded_steps_left, trace.self_occluded_steps_right) == (0, 0)
-    assert trace.position_error_mm < 0.1
-    assert trace.rotation_error_deg < 0.05
-    assert (trace.first_beyond_limit, trace.first_outside_image) == (-1, -1)
-
-
 UNTESTED = "stop.innovation_threshold=0"
 
 
