@@ -10,7 +10,15 @@ from projservo_cli.control import command, make_law
 from projservo_cli.control.law import OK, UNLIMITED, Gains, new_state
 from projservo_cli.geometry.algebra import as_array, mat
 from projservo_cli.laws import CODES
-from projservo_cli.records import ANGLE, MEET, PARALLEL, PERPENDICULAR, InputError, position_limits
+from projservo_cli.records import (
+    ANGLE,
+    MEET,
+    PARALLEL,
+    PERPENDICULAR,
+    InputError,
+    WorkFailed,
+    position_limits,
+)
 from projservo_cli.task.body import SETTLED, fit_body, make_body
 from projservo_cli.task.face import MIDPOINT, center_of, cyclic_order, face_plane
 from projservo_cli.task.incidences import (
@@ -223,6 +231,24 @@ def test_angles_need_axes_that_are_not_parallel():
     asked = [Incidence("pin upright", LINE, WALL, PERPENDICULAR)]
     with pytest.raises(InputError, match="pin upright needs the metric form"):
         incidences_of(slides, make_body(model, M), np.eye(4), asked)
+
+
+@pytest.mark.parametrize(("flat", "kind"), [(((4,), (4,)), "line"), (((4,), (5,), (4, 5)), "plane")])
+def test_points_that_span_no_line_or_plane_are_refused(flat, kind):
+    model, M = random_arm(np.random.default_rng(2))
+    for tool, scene in ((flat, PLANE), (PLANE, flat)):
+        with pytest.raises(WorkFailed, match=f"incidence pin: its points span no {kind}: name others"):
+            incidences_of(model, make_body(model, M), np.eye(4), [Incidence("pin", tool, scene)])
+
+
+def test_a_goal_whose_images_show_too_little_is_refused():
+    model, M = random_arm(np.random.default_rng(2))
+    body = make_body(model, M)
+    rows = incidences_of(model, body, np.eye(4), [Incidence("pin", LINE, LINE)])
+    shows = np.zeros((2, len(M)), dtype=bool)
+    shows[:, 0] = True
+    with pytest.raises(WorkFailed, match="do not determine the pose of the body: show more markers"):
+        weighted(rows, model, body, np.eye(4), shows, face_of(body.M[:4]))
 
 
 def test_a_line_is_turned_across_itself_although_no_first_step_lowers_the_error():
