@@ -7,6 +7,7 @@ from projservo_cli.control.law import LOST, OK, new_state, reset
 from projservo_cli.geometry.kinematics import image_jacobian
 from projservo_cli.laws import CODES
 from projservo_cli.loop.python import BuiltInLaw
+from projservo_cli.task.body import make_body
 from tests.samples import frame, operators, poe
 from tests.scene import GAINS, scene
 
@@ -86,3 +87,13 @@ def test_arrays_of_any_layout_give_the_same_command():
     wanted, found = commanded("stacked", sc, s, q), commanded("stacked", sc, np.asfortranarray(s), apart)
     assert found[0] == wanted[0] == OK
     assert (found[1] == wanted[1]).all()
+
+
+def test_the_error_of_a_face_that_its_body_locates_is_that_of_its_images():
+    """Rms over markers and views; points by themselves have none such."""
+    sc, q, s, _ = instant("RRRRRR", 6, 3)
+    task, wanted = sc.task(), np.sqrt(np.mean(np.sum((s - sc.s_star) ** 2, axis=-1)))
+    for body, error in ((make_body(sc.model, sc.plant.M), wanted), (task.body, np.nan)):
+        law = BuiltInLaw(CODES["exact"], sc.model, task._replace(body=body), GAINS)
+        assert law(s, q)[0] == OK
+        assert law.state.face_px[0] == pytest.approx(error, nan_ok=True)
