@@ -61,10 +61,10 @@ class Physics:
             rendered.rates,
         )
         self._joints = rendered.joints
-        self._data, self._base = (
-            rendered.begin(self._model, q),
-            int(self._model.jnt_bodyid[rendered.joints[0]]),
-        )
+        self._data = rendered.begin(self._model, q)
+        first = int(self._model.jnt_bodyid[rendered.joints[0]])
+        # (g,) whether the first joint of the arm moves a shape.
+        self._carried = np.array([self._carries(first, int(one)) for one in self._model.geom_bodyid], bool)
         self._step_s, self._lag_s = min(_STEP_S, float(self._model.opt.timestep)), lag_s
         self._own = {
             i: actuator
@@ -133,25 +133,24 @@ class Physics:
         model, pairs = self._model, dict[str, None]()
         for contact in self._data.contact:
             bodies = [int(model.geom_bodyid[geom]) for geom in contact.geom]
-            if contact.dist < 0.0 and any(self._carries(body) for body in bodies):
+            if contact.dist < 0.0 and self._carried[contact.geom].any():
                 pairs[" and ".join(model.body(body).name or f"body {body}" for body in bodies)] = None
         return ", ".join(pairs)
 
     def _pressed(self) -> float:
         """Return the size of the sum of all forces on the arm by bodies that it does not move, N."""
-        total, wrench = np.zeros(3), np.zeros(6)
-        for i, contact in enumerate(self._data.contact):
-            first, second = (self._carries(int(self._model.geom_bodyid[geom])) for geom in contact.geom)
-            if first != second:
-                mujoco().mj_contactForce(self._model, self._data, i, wrench)
-                total += (1.0 if second else -1.0) * wrench[:3] @ contact.frame.reshape(3, 3)
+        total, wrench, contact = np.zeros(3), np.zeros(6), self._data.contact
+        first, second = self._carried[contact.geom].T
+        for i in np.flatnonzero(first != second).tolist():
+            mujoco().mj_contactForce(self._model, self._data, i, wrench)
+            total += (1.0 if second[i] else -1.0) * wrench[:3] @ contact.frame[i].reshape(3, 3)
         return float(np.linalg.norm(total))
 
-    def _carries(self, body: int) -> bool:
-        """Whether the first joint of the arm moves a body."""
-        while body > self._base:  # bodies come after what carries them
+    def _carries(self, carrier: int, body: int) -> bool:
+        """Whether a body is another, or fixed or jointed to it from there on."""
+        while body > carrier:  # bodies come after what carries them
             body = int(self._model.body_parentid[body])
-        return body == self._base
+        return body == carrier
 
     def strike(self, by: FloatArray) -> None:
         """Move joints, and where they are sent, by (n,), rad or m, at once."""
