@@ -19,9 +19,9 @@ from projservo_cli.config.inputs import (
     servo_inputs,
     suggestion_inputs,
 )
-from projservo_cli.dependencies import STAGES, Step, inputs_of, key_of_calibration, result_of, steps_for
 from projservo_cli.geometry.jit import CACHE_FOLDER
 from projservo_cli.laws import CODES, POINT_LAWS, law_and_mode, must_converge, run_name
+from projservo_cli.outdated import STAGES, Step, inputs_of, key_of_calibration, result_of, steps_for
 from projservo_cli.progress import Listener
 from projservo_cli.records import Action, FloatArray, InputError, JointList, Plan, WorkFailed
 from projservo_cli.result_hashes import digest

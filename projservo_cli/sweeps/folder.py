@@ -20,9 +20,9 @@ from threadpoolctl import threadpool_limits
 from projservo_cli import provenance
 from projservo_cli.config import Config, stored_yaml
 from projservo_cli.config.inputs import servo_inputs
-from projservo_cli.dependencies import inputs_of, result_of, steps_for
 from projservo_cli.files import write_whole
 from projservo_cli.geometry.jit import CACHE_FOLDER
+from projservo_cli.outdated import inputs_of, result_of, steps_for
 from projservo_cli.records import Calibration, CrossValidation, InputError, Observation, WorkFailed
 from projservo_cli.stages import Progress, calibrate
 from projservo_cli.store.run_file import Result, Run, load, save

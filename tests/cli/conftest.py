@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from projservo_cli import cli, dependencies
+from projservo_cli import cli, outdated
 from projservo_cli.calibration.checks import validation
 from projservo_cli.laws import law_and_mode
 from projservo_cli.records import Calibration, Observation, Plan, Report, Trace, WorkFailed
@@ -106,7 +106,7 @@ def pretend(patch, folder):
     patch.setattr(plan, "run", lambda *given, **brought: pretended.plan(*given))
     patch.setattr(servo, "run", lambda *given, **brought: pretended.servo(*given))
     patch.setattr(report, "run", lambda *given, **named: pretended.report(*given, **named))
-    patch.setattr(dependencies, "_missing", lambda run: pretended.gone)
+    patch.setattr(outdated, "_missing", lambda run: pretended.gone)
     patch.chdir(folder)
     (folder / "tiny.yaml").write_text(CONFIGURATION, encoding="utf-8")
     (folder / "t.csv").write_text(TABLE, encoding="utf-8")

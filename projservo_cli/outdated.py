@@ -1,4 +1,4 @@
-"""Dependencies of stages: which results are up to date, and which must be made first.
+"""Outdated results: the dependencies of stages, and what must be made first.
 
 Every result carries a key: a hash of what its stage is given, and of the keys of the results that it is made
 from. Keys follow from the configuration and the files that it names, so the work is known before
