@@ -20,7 +20,7 @@ from projservo_cli.config.inputs import (
     suggestion_inputs,
 )
 from projservo_cli.geometry.jit import CACHE_FOLDER
-from projservo_cli.laws import CODES, POINT_LAWS, law_and_mode, must_converge, run_name
+from projservo_cli.laws import CODES, POINT_LAWS, codes_of, law_and_mode, must_converge, run_name
 from projservo_cli.outdated import STAGES, Step, inputs_of, key_of_calibration, result_of, steps_for
 from projservo_cli.progress import Listener
 from projservo_cli.records import Action, FloatArray, InputError, JointList, Plan, WorkFailed
@@ -76,7 +76,12 @@ class Chain:
     @property
     def pending(self) -> bool:
         """Whether a result is to be made, or the configuration to be stored."""
-        return self.run.configuration != stored_yaml(self.config) or any(step.why for step in self.steps)
+        return self.run.configuration != stored_yaml(self.config) or bool(self._outdated)
+
+    @property
+    def _outdated(self) -> list[Step]:
+        """The steps whose results are to be made."""
+        return [step for step in self.steps if step.why]
 
     def lacks(self, stage: str) -> bool:
         """Whether a stage was not completed."""
@@ -94,7 +99,7 @@ class Chain:
         """
         moving = None
         if not self.config.plant.simulated and "servo" not in self.names:
-            moving = next((step for step in self.steps if step.stage == "servo" and step.why), None)
+            moving = next((step for step in self._outdated if step.stage == "servo"), None)
         if moving is not None:
             raise InputError(
                 f"{self.names[-1]} needs a run of {moving.law or moving.part} ({moving.why}), which moves "
@@ -125,7 +130,7 @@ class Chain:
 
     def code(self) -> list[tuple[str, str]]:
         """Kind and ``module:Class`` of the imports of the steps, of laws and of a robot."""
-        servo = [law_and_mode(step.law)[0] for step in self.steps if step.law and step.why]
+        servo = [law_and_mode(step.law)[0] for step in self._outdated if step.law]
         found = dict.fromkeys(("law", law) for law in servo if law not in CODES)
         here = self.config.task is not None and self.config.task.start_joints is None
         reads = [one for one in self.steps if one.stage in ("record", "plan") and one.why]
@@ -141,8 +146,7 @@ class Chain:
             return
         for one in self.replayed():
             self.listener.say("{law}: the stored run of {plant}, recorded {date}".format_map(one))
-        pending = [step for step in self.steps if step.why]
-        if pending and (notice := compilation(step.law for step in pending)):
+        if self._outdated and (notice := compilation(step.law for step in self._outdated)):
             self.listener.say(notice)  # the first run on a machine is slower by that
         steps = [step for step in self.steps if step.stage != "record"]
         try:
@@ -497,12 +501,11 @@ class Chain:
 
     def _compiling(self) -> AbstractContextManager[None]:
         """Return the background compilation for runs that follow a calibration."""
-        made = [step.stage for step in self.steps if step.why]
-        if "calibrate" not in made or "servo" not in made:
+        if not {"calibrate", "servo"} <= {step.stage for step in self._outdated}:
             return nullcontext()
         from projservo_cli.loop.jit_warmup import compiling_in_background
 
-        return compiling_in_background(_codes_of(step.law for step in self.steps if step.why))
+        return compiling_in_background(codes_of(step.law for step in self._outdated))
 
 
 def _drives(step: Step) -> bool:
@@ -583,16 +586,11 @@ def compilation(names: Iterable[str] = ()) -> str:
     if CACHE_FOLDER is None:
         return "compiling kernels (in every run: no cache folder can be written)"
     found = any(CACHE_FOLDER.rglob("*.nbi"))
-    if found and (codes := _codes_of(names)):
+    if found and (codes := codes_of(names)):
         from projservo_cli.loop.jit_warmup import are_cached
 
         found = are_cached(codes)
     return "" if found else "compiling kernels, once"
-
-
-def _codes_of(names: Iterable[str]) -> set[int]:
-    """Codes of the built-in laws of runs."""
-    return {CODES[law] for name in names if (law := law_and_mode(name)[0]) in CODES}
 
 
 def _bounded(inputs: PlanInputs, run: Run) -> PlanInputs:

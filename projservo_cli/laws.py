@@ -3,7 +3,7 @@
 A law is added by its kernel in a file of ``control``, a line here and its function in ``control``.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 from projservo_cli.records import InputError
@@ -62,6 +62,11 @@ def run_name(law: str, mode: str) -> str:
 def law_and_mode(name: str) -> tuple[str, str]:
     """Law and mode of the run of a name."""
     return _NAMES.get(name, (name, REGULATE))
+
+
+def codes_of(names: Iterable[str]) -> set[int]:
+    """Codes of the built-in laws of runs, by their names."""
+    return {CODES[law] for name in names if (law := law_and_mode(name)[0]) in CODES}
 
 
 def mode_in(name: str) -> str:

@@ -108,14 +108,14 @@ class Batch:
         numbers = np.full((len(images), len(NUMBERS) + images.shape[2]), math.nan)
         at, made, opened = self.scratch, 0, _NOT_OPENED
         while made < len(images):
-            made += _until_rehearsal(self.setting, images[made:], noise[made:], at, opened, numbers[made:])
+            made += until_rehearsal(self.setting, images[made:], noise[made:], at, opened, numbers[made:])
             if made < len(images):
                 opened, _, _ = self.rehearsal.better(at.task, at.state)
         return numbers
 
 
 @njit
-def _until_rehearsal(
+def until_rehearsal(
     setting: Setting,
     images: FloatArray,
     noise: FloatArray,

@@ -21,7 +21,11 @@ from projservo_cli import provenance
 from projservo_cli.config import Config, stored_yaml
 from projservo_cli.config.inputs import servo_inputs
 from projservo_cli.files import write_whole
-from projservo_cli.geometry.jit import CACHE_FOLDER
+from projservo_cli.geometry.jit import CACHE_FOLDER, is_cached
+from projservo_cli.laws import codes_of
+from projservo_cli.loop.batch import until_rehearsal
+from projservo_cli.loop.compiled import run_compiled
+from projservo_cli.loop.jit_warmup import are_cached
 from projservo_cli.outdated import inputs_of, result_of, steps_for
 from projservo_cli.records import Calibration, CrossValidation, InputError, Observation, WorkFailed
 from projservo_cli.stages import Progress, calibrate
@@ -37,8 +41,6 @@ _PARTS = 4  # of each worker at least
 _SHARED, _OWN = 2_000, 100
 _CALIBRATIONS = 8  # that one process makes in less time than it takes to start another
 _SETTINGS = 64  # as many of a cell, and a part has many runs of each, nearly all of whose time is compiled
-# Indices of the machine code of the closed loop, by whether many runs are made in one call.
-_LOOPS = ("compiled.run_compiled-*.nbi", "batch._until_rehearsal-*.nbi")
 
 
 class _Status(NamedTuple):
@@ -326,20 +328,26 @@ def _calibrate(wanted: tuple[str, Config]) -> _Calibrated:
 
 def _compile_once(design: Design, engine: Engine, say: Callable[[str], None]) -> None:
     """Fill an empty cache by one process, which ends here: the compiler keeps hundreds of megabytes."""
-    loop = _LOOPS[_in_kernel(design, 0)]
-    if not engine.here or engine.workers == 1 or CACHE_FOLDER is None or any(CACHE_FOLDER.rglob(loop)):
+    if not engine.here or engine.workers == 1 or CACHE_FOLDER is None:
+        return
+    loop = until_rehearsal if _in_kernel(design, 0) else run_compiled
+    if is_cached(loop) and are_cached(codes_of(_first_cells(design))):
         return
     say("compiling kernels, once, before the processes start")
     with closing(engine.completed(_first_runs, [design])) as made:
         list(made)
 
 
+def _first_cells(design: Design) -> dict[str, int]:
+    """Return the first cell of each law, by the names of their runs."""
+    cells = range(design.cells // len(design.bases))
+    return {name_of_run(design.cell(cell)): cell for cell in reversed(cells)}
+
+
 def _first_runs(design: Design) -> None:
     """One calibration and a run of each law with it, for the kernels they leave."""
     made = _calibrate((design.calibration_key(0, 0), design.calibrated(0, 0)))
     calibration = None if made.records is None else made.records[1]
-    cells = range(design.cells // len(design.bases))
-    by_law = {name_of_run(design.cell(cell)): cell for cell in reversed(cells)}
-    for cell in by_law.values():
+    for cell in _first_cells(design).values():
         run = cell * design.sweep.runs
         run_part(Part(design, run, run + 1, {design.calibration_key(cell, 0): calibration}))
