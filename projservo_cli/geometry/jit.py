@@ -197,7 +197,11 @@ class _Shared(CPUDispatcher):
         with global_compiler_lock, _uncollected(), ExitStack() as held:
             with suppress(OSError, NotImplementedError):  # no locks, or none for so long: both compile
                 held.enter_context(FileLock(path, timeout=_MOST_S))
-            return super().compile(sig)
+            entry = super().compile(sig)
+        # What has to be called before it runs, its callers have to call too: Numba forgets it as it loads.
+        for made in cast(Any, self).overloads.values():
+            made.library._reload_init.update(made.reload_init)
+        return entry
 
 
 class _Internal(_Shared):

@@ -101,8 +101,15 @@ def inverse(x, y):
 def caller(x):
     return inverse(x, 3.0) + inverse(y=1.0, x=x)
 
+@njit
+def outer(x):
+    return caller(x)
+
 if __name__ == "__main__":
     import one
+    if "outer" in sys.argv:
+        print(one.outer(2.0), sum(one.outer.stats.cache_hits.values()))
+        sys.exit()
     print(one.caller(2.0), sum(one.caller.stats.cache_hits.values()), "fdiv" in one.caller.inspect_llvm(
         one.caller.signatures[0]) if "look" in sys.argv else "")
     try:
@@ -126,3 +133,6 @@ def test_a_separate_function_is_called_where_it_is_and_found_again_by_another_pr
     # The caller holds no division of its own, and the error of the function comes through it.
     assert told("look") == ["2.0", "0", "False", "nothing"]
     assert told() == ["2.0", "1", "nothing"]
+    # So does one that was compiled where its caller was loaded, as after a compilation that was broken off.
+    assert told("outer") == ["2.0", "0"]
+    assert told("outer") == ["2.0", "1"]
