@@ -54,6 +54,8 @@ _MIN_SPREAD = 5.0
 _ELONGATED = 10.0
 # Share of observations, assumed wrong, that may move more than the rest while the robot stands still.
 _MAX_WRONG = 0.1
+# A view stands still whose images move less than this share of those of another view, and less than so far, px.
+_STILL_SHARE, _STILL_PX = 0.03, 3.0
 # Probability that noise alone puts the markers of an image farther off their best line.
 _OFF_LINE_TAIL = 0.1
 ON_A_LINE = "the markers lie on one line: a turn about it shows in no image; add a marker off the line"
@@ -403,6 +405,7 @@ def require_images(detections: Detections, sigma_px: float | None) -> None:
     sigma = max(sigma_px or 0.0, MIN_SIGMA)
     _require_spread(detections, sigma)
     _require_moving(detections, sigma)
+    _require_all_moving(detections)
     _require_no_line(detections, sigma)
 
 
@@ -460,6 +463,18 @@ def _require_moving(detections: Detections, sigma: float) -> None:
         path = np.sqrt(max(float(square.mean()) - 24.0 * sigma**2, 0.0)) if square.size else np.inf
         span = float(np.ptp(detections.q[poses, i]))
         require_moved(int(detections.numbers[i]), span, bool(detections.prismatic[i]), path, sigma)
+
+
+def _require_all_moving(detections: Detections) -> None:
+    """Refuse a view that stands still while another moves: the fit would name the joints or the other view."""
+    moved = [_farthest(detections.of_views([v])) for v in range(len(detections.view))]
+    still, most = int(np.argmin(moved)), int(np.argmax(moved))
+    if np.isfinite(moved[most]) and moved[still] < min(_STILL_SHARE * moved[most], _STILL_PX):
+        raise WorkFailed(
+            f"the {detections.view[still]} images stand still within {moved[still]:.3g} px, while the "
+            f"{detections.view[most]} ones move by {moved[most]:.3g} px: look whether that camera hangs, and "
+            "whether its numbers are those of the markers that move"
+        )
 
 
 def _tracks(detections: Detections) -> tuple[FloatArray, IntArray]:

@@ -353,9 +353,11 @@ def _solve_points(
     H_hat = np.zeros((n, 4, 4))
     H_hat[~prismatic, :3, :3] = cross_matrix(w[~prismatic])
     H_hat[~prismatic, :3, 3] = -np.cross(w, p)[~prismatic]
-    length = np.linalg.norm(p, axis=1)[prismatic]
     if prismatic.any():
-        H_hat[prismatic, :3, 3] = p[prismatic] / length[:, None] * np.median(length)
+        slides = p[prismatic]
+        slides[~slides.any(axis=1), 0] = 1.0  # which no point shows: any direction
+        length = np.linalg.norm(slides, axis=1)
+        H_hat[prismatic, :3, 3] = slides / length[:, None] * np.median(length)
     return Parameters(P, H_hat, prismatic, np.hstack([X, np.ones((m, 1))]))
 
 

@@ -21,7 +21,7 @@ from scipy.optimize import brentq, minimize_scalar
 from scipy.special import chdtri
 
 from projservo_cli.calibration.bundle_adjustment import JointErrors, LeastSquares
-from projservo_cli.calibration.detections import per_rad
+from projservo_cli.calibration.detections import MIN_SIGMA, per_rad
 from projservo_cli.calibration.prediction import Parameters
 from projservo_cli.records import BoolArray, FloatArray
 
@@ -83,7 +83,7 @@ class JointNoise:
             problem = problem.of_markers(keep)
         likelihood = _Likelihood(problem, params, used, sigma_px)
         # Logarithms of the ratio of both noises, rad/px; at the maximum pixels may have far less noise.
-        sigma = likelihood.sigma(_NONE)
+        sigma = max(likelihood.sigma(_NONE), MIN_SIGMA)
         ends = (
             _MIN_SIGMA_Q / sigma,
             _MAX_SIGMA_Q / (sigma if likelihood.given is not None else _SHARE * sigma),

@@ -412,6 +412,8 @@ def fit_inliers(
     for _ in range(_MASK_ROUNDS):
         used = within
         keep = problem.detections.count_of(used) > 0
+        if not keep.any():
+            return None
         some, smaller = _of_markers(problem, params, keep)
         fit = minimize(some, smaller, used[:, keep[problem.detections.marker_of]], robust=False)
         M = params.M.copy()

@@ -9,7 +9,8 @@ from scipy.stats import chi2
 
 from projservo_cli.calibration import calibrate
 from projservo_cli.records import Observation, WorkFailed
-from tests.calibration.simulated_robot import around, random_robot, trials
+from tests.calibration.simulated_robot import NAMES, around, random_robot, trials
+from tests.studies.combined_mistakes import ENDS, ending
 
 SIGMA = 0.5
 TYPES = "RRRRRR"
@@ -117,6 +118,24 @@ def test_images_that_show_one_place_or_one_line(sigma):
     images = np.stack([column, 0.3 * column + 7.0], axis=-1) + noise(sigma, IMAGES.shape)
     message = refusal(changed(seen(), images=images))
     assert "left images show all markers at all poses on one line" in message
+
+
+@pytest.mark.parametrize(("views", "hangs"), [(2, 0), (2, 1), (3, 2)])
+@pytest.mark.parametrize("sigma", [0.0, SIGMA])
+def test_a_camera_that_hangs_is_named_and_neither_another_nor_the_joints(views, hangs, sigma):
+    """The image of one pose at all of them, or markers that stand still under the numbers of others."""
+    robot = random_robot("RRR", np.random.default_rng(views), 10, views)
+    observation = seen(robot, trials(robot, 5))
+    images = observation.images.copy()
+    images[:, hangs] = images[3, hangs] + noise(sigma, images[:, hangs].shape)
+    message = refusal(changed(observation, images=images), "RRR")
+    assert message.startswith(f"the {NAMES[hangs]} images stand still")
+
+
+@pytest.mark.parametrize("seed", [10, 115, 159, 257])
+def test_mistakes_together_end_in_a_calibration_or_a_refusal(seed):
+    """Of three views one that is late, copies of a pose, a view that ends, a camera that hangs."""
+    assert ending(seed)[1] in ENDS
 
 
 @pytest.mark.parametrize("sigma", [0.0, SIGMA])

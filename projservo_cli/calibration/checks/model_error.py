@@ -123,7 +123,8 @@ class _Extent(NamedTuple):
         depth = np.array([[d[u].mean(), max(d[u].std(), 1e-12)] for d, u in zip(depths, used, strict=True)])
         half = np.maximum(0.5 * np.ptp(q, axis=0), 1e-9)
         middle = 0.5 * (q.min(axis=0) + q.max(axis=0))
-        return cls(middle, half, 0.5 * (low + high), 0.5 * (high - low).max(axis=1), depth)
+        radius = np.maximum(0.5 * (high - low).max(axis=1), 1.0)  # of a view of which one detection is left
+        return cls(middle, half, 0.5 * (low + high), radius, depth)
 
 
 def _nuisances(problem: LeastSquares, params: Parameters, extent: _Extent) -> list[_Nuisance]:
