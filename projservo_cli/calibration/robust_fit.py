@@ -400,7 +400,7 @@ def fit_inliers(
     sigma : robust noise of the initial parameters, px; inliers are within 5σ.
     rig_px : noise of the rig, px; a fit that reaches it also tests tracks.
     hopeless : ratio of both above which no rounds follow.
-    Returns None if the fit leaves no degree of freedom, or points behind a camera.
+    Returns None if the fit leaves no degree of freedom, no detection of a view, or points behind a camera.
     """
     if sigma > hopeless * rig_px:
         if (lost := ~np.isfinite(params.M[:, 0])).any():
@@ -411,9 +411,9 @@ def fit_inliers(
     params, within = _within(problem, params, max(sigma, 1e-9), max(sigma, 1e-9), rig_px)
     for _ in range(_MASK_ROUNDS):
         used = within
-        keep = problem.detections.count_of(used) > 0
-        if not keep.any():
+        if not used.any(axis=1).all():
             return None
+        keep = problem.detections.count_of(used) > 0
         some, smaller = _of_markers(problem, params, keep)
         fit = minimize(some, smaller, used[:, keep[problem.detections.marker_of]], robust=False)
         M = params.M.copy()

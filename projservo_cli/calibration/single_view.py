@@ -285,17 +285,17 @@ def _flat_starts(images: FloatArray, focals: FloatArray, middle: FloatArray, mos
         off[k] = np.median(np.linalg.norm(left, axis=1)) / max(float(extent[k]), 1e-9)
     if others.size < _LEAST_POSES or float(np.median(off[others])) > most:
         return []
-    known, starts = others[off[others] <= 4.0 * most], list[_Start]()
+    near, starts = np.isfinite(off) & (off <= 4.0 * most), list[_Start]()
     center = homogeneous(images[first, seen[first]].mean(axis=0)[None])[0]
     for focal in focals.tolist():
         camera = np.array([[focal, 0.0, middle[0]], [0.0, focal, middle[1]], [0.0, 0.0, 1.0]])
         planes = _planes(np.linalg.solve(camera, center))
-        columns = np.linalg.solve(camera, H[known] @ camera)[:, None] @ planes  # (k, planes, 3, 3)
+        columns = np.linalg.solve(camera, H[near] @ camera)[:, None] @ planes  # (k, planes, 3, 3)
         u, v = columns[..., 0], columns[..., 1]
         uu, vv, uv = (u**2).sum(axis=-1), (v**2).sum(axis=-1), (u * v).sum(axis=-1)
         wrong = np.median(((uu - vv) ** 2 + 4.0 * uv**2) / (uu + vv) ** 2, axis=0)
         for number in np.argsort(wrong)[:_PLANES_TRIED]:
-            starts.append(_flat_start(images, camera, H, planes[number], off <= 4.0 * most))
+            starts.append(_flat_start(images, camera, H, planes[number], near))
     return starts
 
 

@@ -84,10 +84,11 @@ class TaskImages(NamedTuple):
         return np.flatnonzero(shown)[:2] if shown.sum() > 1 else np.arange(0)
 
     def by_points(self) -> "TaskImages":
-        """Select the markers of the face, to measure it point by point."""
+        """Select the markers of the face, to measure it point by point; incidences need the body."""
         m = self.s_start.shape[1] - self.pins
         s_start, s_star = (np.ascontiguousarray(s[:, :m]) for s in (self.s_start, self.s_star))
-        return self._replace(s_start=s_start, s_star=s_star, pins=0, body=NO_BODY)
+        face = self._replace(s_start=s_start, s_star=s_star, pins=0, body=NO_BODY)
+        return face._replace(incidences=(), s_taught=None)
 
     def taught(self) -> "TaskImages":
         """Return the task to the pose that was taught."""

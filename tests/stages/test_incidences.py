@@ -51,6 +51,16 @@ def test_a_pin_goes_into_its_hole_and_the_rest_stays_free(law):
     assert trace.incidence_mm.max() < 0.1
 
 
+@pytest.mark.parametrize("law", ["stacked", "euclidean_points"])
+def test_laws_that_measure_points_go_to_a_pose_where_the_incidences_hold(law):
+    """To that of the plan; they end above stop.image_error_px, which the errors of the calibration exceed."""
+    config, calibration, planned = made()
+    trace = servo.run(config, calibration, planned, law)
+    assert trace.verdict == "no progress"
+    assert trace.incidences == ("pin on hole", "tip on bottom")
+    assert trace.incidence_mm[-1].max() < 0.2
+
+
 def test_features_of_tool_and_scene_are_drawn_where_they_are():
     """In space within two millimetres; in the images, the film and the 3D view."""
     config, calibration, planned = made()
