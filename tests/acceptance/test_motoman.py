@@ -6,12 +6,11 @@ self-observation", RCIM 73, 2022.
 """
 
 import dataclasses
-import time
 
 import numpy as np
 import pytest
 
-from projservo_cli.calibration import calibrate, residual_statistics
+from projservo_cli.calibration import bundle_adjustment, calibrate, residual_statistics
 from projservo_cli.metric.position_error import position_errors
 from projservo_cli.records import InputError, WorkFailed
 from projservo_cli.results import ImageModel
@@ -125,16 +124,23 @@ def test_wrong_readings_are_listed(tables, spoil):
         assert len(joints) >= 0.8 * len(wrong)
 
 
-def test_the_metric_agrees_with_a_laser_tracker(shared_data):
+def test_the_metric_agrees_with_a_laser_tracker(shared_data, monkeypatch):
     """Positions of a reflector at 68 poses that the calibration saw neither in images nor by the tracker.
 
     The manufacturer's table errs by 0.230 mm rms there, and one fitted to the tracker itself by 0.078 mm: of
-    the latter, 0.045 mm an axis show in no image.
+    the latter, 0.045 mm an axis show in no image. Searches end in flat valleys: without that, observations
+    are expanded 704,352 times.
     """
     folder = shared_data / "motoman"
-    begin = time.process_time()
+    expanded, expand = [], bundle_adjustment._Expansion.__init__
+
+    def counted(self, problem, *given):
+        expanded.append(problem.detections.pose_of.size)
+        expand(self, problem, *given)
+
+    monkeypatch.setattr(bundle_adjustment._Expansion, "__init__", counted)
     calibration = fit(read_table(folder / "leica_train.csv"), joint_noise=None)
-    assert time.process_time() - begin < 16.0  # of 30 before searches ended in flat valleys
+    assert 928 < sum(expanded) <= 450_000
     train, test = (
         read_positions(folder / f"leica_{part}_positions.csv", "RRRRRR") for part in ("train", "test")
     )
