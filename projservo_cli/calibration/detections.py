@@ -54,7 +54,7 @@ _MIN_SPREAD = 5.0
 _ELONGATED = 10.0
 # Share of observations, assumed wrong, that may move more than the rest while the robot stands still.
 _MAX_WRONG = 0.1
-# A view stands still whose images move less than this share of those of another view, and less than so far, px.
+# A view stands still whose images move less than this share of those of another one, and less than that, px.
 _STILL_SHARE, _STILL_PX = 0.03, 3.0
 # Probability that noise alone puts the markers of an image farther off their best line.
 _OFF_LINE_TAIL = 0.1
@@ -466,7 +466,7 @@ def _require_moving(detections: Detections, sigma: float) -> None:
 
 
 def _require_all_moving(detections: Detections) -> None:
-    """Refuse a view that stands still while another moves: the fit would name the joints or the other view."""
+    """Refuse a view that stands still while another moves: the fit would name the joints or the other."""
     moved = [_farthest(detections.of_views([v])) for v in range(len(detections.view))]
     still, most = int(np.argmin(moved)), int(np.argmax(moved))
     if np.isfinite(moved[most]) and moved[still] < min(_STILL_SHARE * moved[most], _STILL_PX):

@@ -103,14 +103,20 @@ def test_every_kind_has_words_and_a_code():
 
 @pytest.mark.parametrize(
     ("moved", "types", "combined", "at", "seed"),
-    [((0, 1), "RR", 10, 12, 12), ((1,), "RR", 10, 12, 12), ((1,), "RRR", 12, 16, (100, 16))],
+    [
+        ((0, 1), "RR", 10, 12, 12),
+        ((1,), "RR", 10, 12, 12),
+        ((1,), "RRR", 12, 16, (100, 16)),
+        ((1,), "RRR", 12, 16, (107, 16)),
+    ],
 )
 def test_a_table_that_is_bumped_amid_the_recording_is_named_and_no_readings_are(
     moved, types, combined, at, seed
 ):
     """Both cameras see the base move alike; one camera that moves is told from that.
 
-    Where the last arm is tried with other types of joints, no detection fits it.
+    Where the third table is tried with other types of joints, no detection fits it; of the last all images
+    together have no epipolar geometry.
     """
     rng = np.random.default_rng(seed)
     robot = random_robot(types, rng)
@@ -126,5 +132,6 @@ def test_a_table_that_is_bumped_amid_the_recording_is_named_and_no_readings_are(
     with pytest.raises(WorkFailed) as refused:
         calibrate(seen, types, source="recorded", joint_noise=None)
     what = "the right camera" if moved == (1,) else "the base of the arm or all cameras"
+    what = "one camera" if seed == (107, 16) else what
     assert f"{what} moved at pose {at}" in str(refused.value)
     assert "check the joint readings" not in str(refused.value)

@@ -1,4 +1,4 @@
-"""Numbers of markers, or poses, that differ between both views: tags exchanged or images late in one of them.
+"""Views that contradict each other: tags exchanged or images late in one of them, or one that moved.
 
 A robot fits such a table with half of these detections rejected: only the epipolar geometry shows it.
 """
@@ -25,6 +25,9 @@ _ALIKE = 0.1
 _MUCH_NOISE_PX = 1.0
 # Residual of a corner, in deviations of the geometry of few points, above which it misfits.
 _OF_FEW = 15.0
+# Share of the detections of a pose that misfit the geometry of others where a camera moved, share of such
+# poses from there on, and minimum number of them.
+_MISFIT, _NEARLY_ALL, _LEAST_MOVED = 0.5, 0.9, 5
 # Maximum number of tags whose own geometry is tried.
 _MAX_TAGS = 6
 # Corners of a tag, numbered 4 t to 4 t + 3.
@@ -38,7 +41,8 @@ def checked_geometry(detections: Detections, frame: ImageFrame, rng: np.random.G
 
     The images do not tell which view is right, and goals are given by numbers, so nothing is renumbered.
 
-    Raises WorkFailed naming the tags or markers or the view that is late, or as ``Epipolar.of`` does.
+    Raises WorkFailed naming the tags or markers, the view that is late or the pose at which one moved, or as
+    ``Epipolar.of`` does.
     """
     if len(detections.pair) == 1:
         return RigidBody.of(detections, frame)
@@ -47,6 +51,7 @@ def checked_geometry(detections: Detections, frame: ImageFrame, rng: np.random.G
     except WorkFailed:
         _require_alike(detections, _by_tags(detections))
         _require_one_pose(detections)
+        _require_one_rig(detections)
         raise
     order = _true_order(detections, found, OUTLIER)
     if found.sigma_px > _MUCH_NOISE_PX and (order == np.arange(order.size)).all():
@@ -73,6 +78,35 @@ def _require_one_pose(detections: Detections) -> None:
                 "epipolar geometry: let each pose settle for longer (plant.settle_s), and take the newest "
                 "frame of both cameras"
             )
+
+
+def _require_one_rig(detections: Detections) -> None:
+    """Refuse images amid which one camera moved."""
+    poses = np.arange(len(detections.q))
+    for order, words in ((poses, "from it on"), (poses[::-1], "before it")):
+        if gone := _misfitting(detections, order):
+            at = detections.pose[gone if words == "before it" else -gone]
+            raise WorkFailed(
+                f"one camera moved at pose {at}, by the epipolar geometry: record again, or remove the "
+                f"{gone} poses {words}"
+            )
+
+
+def _misfitting(detections: Detections, order: IntArray) -> int:
+    """Number of the last poses, in an order (K,), that misfit the geometry of the first half; 0 for a few."""
+    half = detections.of_poses(np.isin(np.arange(order.size), order[: order.size // 2]))
+    try:
+        geometry = Epipolar.of(half, np.random.default_rng(0))
+    except WorkFailed:
+        return 0
+    off = detections.both & ~geometry.within(detections, OUTLIER)
+    count, wrong = (
+        np.bincount(detections.pose_of[of], minlength=order.size) for of in (detections.both, off)
+    )
+    moved = (wrong > _MISFIT * count)[order[::-1]]
+    share = np.cumsum(moved) / np.arange(1, order.size + 1)
+    gone = int(np.flatnonzero(moved & (share >= _NEARLY_ALL)).max(initial=-1)) + 1
+    return gone if gone >= _LEAST_MOVED else 0
 
 
 def _require_alike(detections: Detections, order: IntArray) -> None:
