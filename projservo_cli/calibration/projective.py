@@ -100,7 +100,13 @@ def _isotropic(params: Parameters, a_inf: FloatArray, moved: FloatArray) -> Proj
     P = params.P
     points = moved / (moved @ a_inf)[:, None]
     M = params.M / (params.M @ a_inf)[:, None]
-    L = np.linalg.cholesky(points.T @ points / len(points))
+    try:
+        L = np.linalg.cholesky(points.T @ points / len(points))
+    except np.linalg.LinAlgError:
+        raise WorkFailed(
+            "the fit leaves all markers at all poses in one plane: the images do not show the depth; move "
+            "the joints farther, or add a camera"
+        ) from None
     rows = (P[0] @ L)[[2, 0, 1]]
     depth = points @ P[0, 2]
     rows = rows * np.sign(depth.sum())

@@ -110,12 +110,7 @@ class RigidBody(ImageGeometry):
         """
         pose, marker, images, weight = _chosen(detections)
         focals, middle = float(frame.size[0]) * np.array(_FOCALS), frame.center[0]
-        starts = _flat_starts(images, focals, middle, _PLANE) or _deep_starts(images, focals, middle)
-        rough = _all_fitted(images, weight, starts, middle, _ROUGHLY)[:_FEW]
-        if not rough:  # small turns hardly show the depth of a body: it is taken as flat at first
-            starts = _flat_starts(images, focals, middle, np.inf)
-            rough = _all_fitted(images, weight, starts, middle, _ROUGHLY)[:_FEW]
-        bodies = _all_fitted(images, weight, [body.start for body in rough], middle, _EVALUATIONS)
+        bodies = _explaining(images, weight, focals, middle)
         if not bodies:
             raise WorkFailed(
                 f"no rigid body explains the images of the {detections.view[0]} camera: check marker "
@@ -197,6 +192,27 @@ def _chosen(detections: Detections) -> tuple[IntArray, IntArray, FloatArray, Flo
     return pose, marker, images[which], weight[which]
 
 
+def _explaining(
+    images: FloatArray, weight: FloatArray, focals: FloatArray, middle: FloatArray
+) -> list[_Body]:
+    """Return bodies that explain images (K, m, 2), best first: flat or not, and in both senses of depth.
+
+    weight : (K, m) of the residuals; focals : focal lengths to begin with, px.
+    """
+
+    def fitted(starts: list[_Start], count: int) -> list[_Body]:
+        """Fit the best few of many starts."""
+        rough = _all_fitted(images, weight, starts, middle, _ROUGHLY)[:count]
+        return _all_fitted(images, weight, [body.start for body in rough], middle, _EVALUATIONS)
+
+    bodies = fitted(_flat_starts(images, focals, middle, _PLANE), _FEW)
+    bodies = bodies or fitted(_deep_starts(images, focals, middle), _FEW)
+    # Small turns hardly show the depth of a body: it is taken as flat at first.
+    bodies = bodies or fitted(_flat_starts(images, focals, middle, np.inf), _FEW)
+    others = fitted(_reversed(bodies[0], focals), 1) if bodies else []
+    return sorted([*bodies, *others], key=lambda body: body.cost)
+
+
 def _factorised(images: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Affine cameras A (K, 2, 3) and b (K, 2), and a shape (m, 3), of images (K, m, 2), NaN if unseen.
 
@@ -261,6 +277,17 @@ def _posed(A: FloatArray, b: FloatArray, X: FloatArray, focal: float, middle: Fl
     turn *= np.arctan(size) / np.maximum(size, 1e-12)
     R = Rotation.from_rotvec(turn).as_matrix() @ R
     return _Start(R, ray * (focal / s.mean(axis=1))[:, None], X, focal)
+
+
+def _reversed(body: _Body, focals: FloatArray) -> list[_Start]:
+    """Starts of a body reversed in depth, which orthography sees alike, at each focal length, px."""
+    ray, inside_out = body.t / np.linalg.norm(body.t, axis=1, keepdims=True), np.diag([1.0, 1.0, -1.0])
+    R = (np.eye(3) - 2.0 * ray[:, :, None] * ray[:, None]) @ body.R @ inside_out
+    deeper = np.array([[1.0, 1.0, focal / body.focal[0]] for focal in focals])
+    return [
+        _Start(R, body.t * by, body.X @ inside_out, focal)
+        for by, focal in zip(deeper, focals.tolist(), strict=True)
+    ]
 
 
 def _flat_starts(images: FloatArray, focals: FloatArray, middle: FloatArray, most: float) -> list[_Start]:
