@@ -146,9 +146,9 @@ class Epipolar(ImageGeometry):
         parallax = float(np.median(_transfer(a[inlier], b[inlier]) / T_[0, 0]))
         if parallax < _MIN_PARALLAX * sigma:
             raise WorkFailed(
-                "both cameras see the same up to a change of image coordinates: without a baseline, or "
-                "with all markers always in one plane, there is no depth; move the cameras apart, or the "
-                "markers in depth"
+                f"both cameras see the same up to a change of image coordinates, within {parallax:.3g} px at "
+                f"a noise of {sigma:.3g} px: without a baseline, or with all markers always in one plane, "
+                "there is no depth; move the cameras apart, the markers in depth, or have less noise"
             )
         return cls(sigma, Core.of(residual, pose_of), in_pixels, inlier, parallax)
 
