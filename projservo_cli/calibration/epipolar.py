@@ -105,6 +105,19 @@ class Epipolar(ImageGeometry):
 
     @classmethod
     def of(cls, detections: Detections, rng: np.random.Generator) -> "Epipolar":
+        """Estimate the geometry as ``fitted`` does; raises WorkFailed also where it shows no depth."""
+        found = cls.fitted(detections, rng)
+        if found.parallax_px < _MIN_PARALLAX * found.sigma_px:
+            raise WorkFailed(
+                "both cameras see the same up to a change of image coordinates, within "
+                f"{found.parallax_px:.3g} px at a noise of {found.sigma_px:.3g} px: without a baseline, or "
+                "with all markers always in one plane, there is no depth; move the cameras apart, the "
+                "markers in depth, or have less noise"
+            )
+        return found
+
+    @classmethod
+    def fitted(cls, detections: Detections, rng: np.random.Generator) -> "Epipolar":
         """Estimate the fundamental matrix and the noise from observations by both views, some of them wrong.
 
         By the minimum median of Sampson distances over random samples of eight, then reweighted eight-point
@@ -144,12 +157,6 @@ class Epipolar(ImageGeometry):
             raise WorkFailed("the observations of the two cameras share no epipolar geometry: check the rows")
         sigma = float(np.sqrt((residual[inlier] ** 2).sum() / (inlier.sum() - _PARAMETERS)))
         parallax = float(np.median(_transfer(a[inlier], b[inlier]) / T_[0, 0]))
-        if parallax < _MIN_PARALLAX * sigma:
-            raise WorkFailed(
-                f"both cameras see the same up to a change of image coordinates, within {parallax:.3g} px at "
-                f"a noise of {sigma:.3g} px: without a baseline, or with all markers always in one plane, "
-                "there is no depth; move the cameras apart, the markers in depth, or have less noise"
-            )
         return cls(sigma, Core.of(residual, pose_of), in_pixels, inlier, parallax)
 
     @property

@@ -132,6 +132,13 @@ def test_a_camera_that_hangs_is_named_and_neither_another_nor_the_joints(views, 
     assert message.startswith(f"the {NAMES[hangs]} images stand still")
 
 
+def test_views_that_show_little_depth_are_not_taken_for_late():
+    """Joints to and fro pair images of other poses as well as their own."""
+    robot = random_robot("P", np.random.default_rng(3), markers=4)
+    q = trials(robot, 12, length=0.03)
+    assert "without a baseline" in refusal(seen(robot, q), "P")
+
+
 @pytest.mark.parametrize("seed", [10, 115, 159, 257, 3356, 3924])
 def test_mistakes_together_end_in_a_calibration_or_a_refusal(seed):
     """Of three views one that is late, copies of a pose, a view that ends, a camera that hangs, few markers

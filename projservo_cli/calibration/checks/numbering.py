@@ -23,6 +23,8 @@ _DOUBTED = 0.5
 _ALIKE = 0.1
 # Noise of the epipolar geometry, px, above which most of the numbers may be wrong.
 _MUCH_NOISE_PX = 1.0
+# Maximum noise of images paired otherwise, over that of those of one pose, where they belong together.
+_LESS = 0.7
 # Residual of a corner, in deviations of the geometry of few points, above which it misfits.
 _OF_FEW = 15.0
 # Share of the detections of a pose that misfit the geometry of others where a camera moved, share of such
@@ -62,7 +64,10 @@ def checked_geometry(detections: Detections, frame: ImageFrame, rng: np.random.G
 
 
 def _require_one_pose(detections: Detections) -> None:
-    """Refuse images of one view that show the pose before that of the other."""
+    """Refuse images of one view that show the pose before that of the other: its noise is less by far."""
+    limit_px = _MUCH_NOISE_PX
+    with suppress(WorkFailed):
+        limit_px = min(limit_px, _LESS * Epipolar.fitted(detections, np.random.default_rng(0)).sigma_px)
     left, right = _dense(detections, np.arange(detections.marker.size))
     for late, together in enumerate(((left[1:], right[:-1]), (left[:-1], right[1:]))):
         pairs = Observation(
@@ -71,7 +76,7 @@ def _require_one_pose(detections: Detections) -> None:
         shifted, noise_px = Detections.of(pairs, "R" * detections.q.shape[1]), np.inf
         with suppress(WorkFailed):
             noise_px = Epipolar.of(shifted, np.random.default_rng(0)).sigma_px
-        if noise_px < _MUCH_NOISE_PX:
+        if noise_px < limit_px:
             names = [detections.view[v] for v in detections.pair]
             raise WorkFailed(
                 f"each {names[late]} image shows the pose before that of the {names[1 - late]} one, by the "
