@@ -15,7 +15,7 @@ import numpy as np
 
 from projservo_cli.calibration.bundle_adjustment import LeastSquares
 from projservo_cli.calibration.checks.model_error import suspected
-from projservo_cli.calibration.detections import MAX_JUDGED, per_rad
+from projservo_cli.calibration.detections import MAX_JUDGED, format_motion, per_rad
 from projservo_cli.calibration.epipolar import ImageGeometry
 from projservo_cli.calibration.robust_fit import Solution, fit_from, left_out_errors, left_out_px
 from projservo_cli.geometry.joint_curve import basis, slopes, torques
@@ -114,6 +114,12 @@ def hypotheses_of(asked: str | Iterable[str], joint_types: str, mount: str) -> l
             )
         if kind == "harmonic" and set(joints) & set(slides):
             raise InputError(f"joint model {word!r}: prismatic joint {joints[0]} has no turn; leave it out")
+        # A coupling needs two joints, a prismatic joint has no turn, and the first one no scale; where none
+        # turns, the load of each is constant.
+        turn = n - len(slides)
+        others = {"coupling": n - 1, "harmonic": turn, "sag": turn, "scale": n - bool(slides)}
+        if not others.get(kind, n):
+            raise InputError(f"joint model {word!r}: no joint of {joint_types} can have it; leave it out")
         pairs = [(i, j) for i in range(1, n + 1) for j in range(1, n + 1) if i != j]
         found += [Hypothesis(kind, one) for one in (pairs if kind == "coupling" and not joints else [joints])]
     return list(dict.fromkeys(found))
@@ -152,7 +158,7 @@ def fit_joint_model(
         raise WorkFailed(f"no fit with the joint model {names} explains the images: leave some of it out")
     if asked is not None:
         search.require_known(found, chosen)
-    if found.params.curve is None:
+    if found.params.curve is None or not len(found.params.curve.terms):  # none is left of those of all joints
         return None
     before = search.gains
     now = left_out_px(found)
@@ -300,11 +306,13 @@ class _Search:
             return
         key = _keys(curve)[t]
         name = next(one.words for one, keys in _terms(chosen, found).items() if key in keys)
-        number = problem.detections.numbers[joint[t]]
+        i = joint[t]
+        a_rad, slides = per_rad(params.prismatic)[i], bool(params.prismatic[i])
+        amount, most_allowed = (format_motion(x * a_rad, slides) for x in (off[t], _OPEN))
         raise WorkFailed(
-            f"joint model {name}: the data do not determine it, joint {number} may be off by "
-            f"{np.degrees(off[t]):.2g}°, more than {np.degrees(_OPEN):.2g}° within its range: leave it out, "
-            "or record more poses in which the joint moves farther"
+            f"joint model {name}: the data do not determine it, joint {problem.detections.numbers[i]} may be "
+            f"off by {amount}, more than {most_allowed} within its range: leave it out, or record more poses "
+            "in which the joint moves farther"
         )
 
 

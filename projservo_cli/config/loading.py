@@ -60,6 +60,9 @@ _PHRASES = {
     "value_error": "{error}",
 }
 
+# Parts of a position that pydantic adds: of a key of a mapping, and of each kind that a value may be of.
+_INNER = re.compile(r"\[key\]|constrained-\w+|(literal|tuple)\[.*")
+
 # Values that name files, relative to the configuration.
 _FILES = (
     *(("data", "table"), ("data", "readings")),
@@ -629,15 +632,32 @@ def _check_options(document: _Document) -> None:
 
 
 def _translated(model: type[BaseModel], errors: Sequence[ErrorDetails]) -> Iterator[Finding]:
-    """Return the findings of pydantic, in words."""
-    positions = [tuple(part for part in error["loc"] if part != "[key]") for error in errors]
-    for error, place in list(zip(errors, positions, strict=True))[:_MOST]:
+    """Return the findings of pydantic, in words; of a value that may be of several kinds one finding."""
+    places = [tuple(part for part in error["loc"] if not _is_inner(part)) for error in errors]
+    for error, place in list(zip(errors, places, strict=True))[:_MOST]:
         if error["type"] == CONTRADICTIONS:
             yield from error["ctx"]["found"]
             continue
-        inside = any(len(other) > len(place) and other[: len(place)] == place for other in positions)
-        if not (inside and error["type"] == "too_short"):  # a list counts only its valid entries
+        inside = any(len(other) > len(place) and other[: len(place)] == place for other in places)
+        kinds = [one for one, other in zip(errors, places, strict=True) if other == place]
+        if inside and (error["type"] == "too_short" or _is_inner(error["loc"][-1])):
+            continue  # a list counts only its valid entries, and is of its kind
+        if len(kinds) == 1:
             yield place, _phrase(model, error)
+        elif error is kinds[0]:
+            yield place, _phrase_of_kinds([_phrase(model, one) for one in kinds], error["input"])
+
+
+def _is_inner(part: int | str) -> bool:
+    """Whether a part of a position is no key of a configuration: that of a mapping's key, or of a kind."""
+    return isinstance(part, str) and bool(_INNER.fullmatch(part))
+
+
+def _phrase_of_kinds(phrases: Sequence[str], given: Any) -> str:
+    """Combine what a value is not, kind by kind."""
+    kinds = [re.sub(r".*; valid: ", "", one).removeprefix("must be ") for one in phrases]
+    words = " or ".join(one.removesuffix(f", not {_displayed(given)}") for one in kinds)
+    return f"must be {words}, not {_displayed(given)}"
 
 
 def _phrase(model: type[BaseModel], error: ErrorDetails) -> str:

@@ -6,7 +6,7 @@ import h5py
 import numpy as np
 import pytest
 
-from projservo_cli.calibration import calibrate, predict, prediction_variance
+from projservo_cli.calibration import calibrate, joint_model, predict, prediction_variance
 from projservo_cli.calibration.bundle_adjustment import LeastSquares
 from projservo_cli.calibration.detections import Detections
 from projservo_cli.calibration.joint_model import describe_curve, hypotheses_of
@@ -205,6 +205,29 @@ def test_gauge_and_mistakes_are_refused_by_name(word, says):
         hypotheses_of([word], "RRPRR", "world")
     with pytest.raises(InputError, match="weight"):
         hypotheses_of("sag", "RRRRR", "tool")
+
+
+@pytest.mark.parametrize(
+    ("word", "types"), [("coupling", "R"), ("scale", "P"), ("harmonic", "PP"), ("sag", "PP")]
+)
+def test_a_curve_that_no_joint_can_have_is_refused(word, types):
+    with pytest.raises(InputError, match=f"joint model '{word}': no joint of {types} can have it"):
+        hypotheses_of([word], types, "world")
+
+
+def test_a_curve_of_all_joints_of_which_no_term_is_left_is_none(monkeypatch):
+    """The scale of a single prismatic joint sets that of the frame."""
+
+    def chosen(search):
+        scale = hypotheses_of(["scale"], "RP", "world")
+        return scale, search.with_curve(scale)
+
+    monkeypatch.setattr(joint_model._Search, "automatic", chosen)
+    robot = random_robot("P", np.random.default_rng(1), 7)
+    seen = robot.observe(trials(robot, 6), 0.1, np.random.default_rng(2))
+    found = calibrate(seen, "P", source="recorded", joint_noise=None, joint_model="auto")
+    assert found.usable
+    assert found.joint_curve is None
 
 
 def test_what_the_data_leave_open_is_refused_by_name():

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from projservo_cli.config import load_config, to_yaml
+from projservo_cli.config import load_config, shipped, to_yaml
 from projservo_cli.config.inputs import servo_inputs
 from projservo_cli.laws import LAW_SPECS, LAWS
 from projservo_cli.records import InputError
@@ -261,3 +261,17 @@ def test_objects_before_cameras_on_the_tool_are_refused_in_one_line(good):
     wanted = [f"objects.block={{markers: [40, 41, 42], {AT}}}", "rig.mount=tool"]
     (found,) = errors(good, *wanted)
     assert "objects: cameras on the tool see the scene that the goal is on: its images carry" in found
+
+
+@pytest.mark.parametrize(
+    ("override", "says"),
+    [
+        ("trajectory.visible_views=0", "trajectory.visible_views: must be all or at least 1, not 0"),
+        ("calibration.joint_model=gear", "calibration.joint_model: must be auto or a list, not 'gear'"),
+        ("calibration.joint_model=[1]", "calibration.joint_model.0: must be text; put it in quotes, not 1"),
+    ],
+)
+def test_a_value_that_may_be_of_several_kinds_is_refused_in_one_line(override, says):
+    with pytest.raises(InputError) as refused:
+        load_config(shipped("paper"), [override])
+    assert str(refused.value) == f"--set {override}: {says}"
