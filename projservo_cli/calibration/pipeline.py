@@ -179,6 +179,11 @@ def calibrate(
     curves = None if joint_model == AUTO else hypotheses_of(joint_model or (), joint_types, mount)
     if (curves is None or curves) and method != "bundle_adjustment":
         raise InputError(f"calibration method {method!r} fits no joint model: choose bundle_adjustment")
+    if method == "closed_form" and len(observation.view) != 2:
+        raise InputError(
+            f"calibration method closed_form takes two views, not {', '.join(observation.view)}: choose "
+            "bundle_adjustment"
+        )
     begin = time.perf_counter()
     solution = None
     # The matrices are small: a second thread costs more than it gives.
@@ -201,8 +206,7 @@ def calibrate(
             expected.require_scale(detections.view)
         require_images(whole, max(epipolar.sigma_px, expected.sigma_px))
         if method == "closed_form":
-            if not isinstance(epipolar, Epipolar):
-                raise InputError("calibration method closed_form takes two views: choose bundle_adjustment")
+            assert isinstance(epipolar, Epipolar)
             result = _closed_form(detections, epipolar, expected)
         else:
             problem = LeastSquares.of(detections, detections.reference())
