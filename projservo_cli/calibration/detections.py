@@ -56,6 +56,8 @@ _ELONGATED = 10.0
 _MAX_WRONG = 0.1
 # A view stands still whose images move less than this share of those of another one, and less than that, px.
 _STILL_SHARE, _STILL_PX = 0.03, 3.0
+# Minimum share of a beginning, or an end, of the poses that is nearly all of it.
+_NEARLY_ALL = 0.9
 # Probability that noise alone puts the markers of an image farther off their best line.
 _OFF_LINE_TAIL = 0.1
 ON_A_LINE = "the markers lie on one line: a turn about it shows in no image; add a marker off the line"
@@ -475,6 +477,12 @@ def _require_all_moving(detections: Detections) -> None:
             f"{detections.view[most]} ones move by {moved[most]:.3g} px: look whether that camera hangs, and "
             "whether its numbers are those of the markers that move"
         )
+
+
+def beginning_in(mask: BoolArray) -> int:
+    """Length of the longest beginning of a mask (K,) that is nearly all in it, its end too; 0 for none."""
+    share = np.cumsum(mask) / np.arange(1, len(mask) + 1)
+    return int(np.flatnonzero(mask & (share >= _NEARLY_ALL)).max(initial=-1)) + 1
 
 
 def _tracks(detections: Detections) -> tuple[FloatArray, IntArray]:

@@ -4,12 +4,12 @@ import dataclasses
 
 import numpy as np
 import pytest
-from scipy.linalg import expm
 
 from projservo_cli.calibration import calibrate, predict
 from projservo_cli.calibration.checks import model_error
 from projservo_cli.records import ModelError, Observation, WorkFailed
 from tests.calibration.simulated_robot import around, random_robot, trials
+from tests.studies.combined_mistakes import bump
 
 SIGMA, K, HELD_OUT, ANGLE = 0.3, 50, 40, 0.7
 TYPES = "RRRRR"
@@ -121,10 +121,8 @@ def test_a_table_that_is_bumped_amid_the_recording_is_named_and_no_readings_are(
     rng = np.random.default_rng(seed)
     robot = random_robot(types, rng)
     q = np.vstack([trials(robot, 5, np.radians(20)), around(robot, combined, rng, np.radians(20))])
-    w, bump = np.radians(1.5) * rng.standard_normal(3), np.zeros((4, 4))
-    bump[:3, :3], bump[:3, 3] = np.cross(np.eye(3), w), 0.006 * rng.standard_normal(3)
     cameras = robot.cameras.copy()
-    cameras[[*moved]] = cameras[[*moved]] @ expm(bump)
+    cameras[[*moved]] = cameras[[*moved]] @ bump(rng, 1.5)
     images = robot.images(q)
     images[at:] = dataclasses.replace(robot, cameras=cameras).images(q[at:])
     images += 0.1 * rng.standard_normal(images.shape)

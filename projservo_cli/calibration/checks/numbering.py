@@ -9,7 +9,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.sparse.csgraph import connected_components
 
-from projservo_cli.calibration.detections import Detections
+from projservo_cli.calibration.detections import Detections, beginning_in
 from projservo_cli.calibration.epipolar import OUTLIER, Epipolar, ImageFrame, ImageGeometry, sampson
 from projservo_cli.calibration.single_view import RigidBody
 from projservo_cli.geometry.displacements import homogeneous
@@ -23,13 +23,13 @@ _DOUBTED = 0.5
 _ALIKE = 0.1
 # Noise of the epipolar geometry, px, above which most of the numbers may be wrong.
 _MUCH_NOISE_PX = 1.0
-# Maximum noise of images paired otherwise, over that of those of one pose, where they belong together.
+# Maximum noise of images paired with those of the next pose, over that of images of one pose, of a late view.
 _LESS = 0.7
 # Residual of a corner, in deviations of the geometry of few points, above which it misfits.
 _OF_FEW = 15.0
-# Share of the detections of a pose that misfit the geometry of others where a camera moved, share of such
-# poses from there on, and minimum number of them.
-_MISFIT, _NEARLY_ALL, _LEAST_MOVED = 0.5, 0.9, 5
+# Share of the detections of a pose that misfit the geometry of others where a camera moved, and minimum
+# number of such poses.
+_MISFIT, _LEAST_MOVED = 0.5, 5
 # Maximum number of tags whose own geometry is tried.
 _MAX_TAGS = 6
 # Corners of a tag, numbered 4 t to 4 t + 3.
@@ -52,31 +52,40 @@ def checked_geometry(detections: Detections, frame: ImageFrame, rng: np.random.G
         found = Epipolar.of(detections, rng)
     except WorkFailed:
         _require_alike(detections, _by_tags(detections))
-        _require_one_pose(detections)
+        _require_one_pose(detections, _noise_px(detections))
         _require_one_rig(detections)
         raise
     order = _true_order(detections, found, OUTLIER)
     if found.sigma_px > _MUCH_NOISE_PX and (order == np.arange(order.size)).all():
         order = _by_tags(detections)
-        _require_one_pose(detections)
+        _require_one_pose(detections, found.sigma_px)
     _require_alike(detections, order)
     return found
 
 
-def _require_one_pose(detections: Detections) -> None:
-    """Refuse images of one view that show the pose before that of the other: its noise is less by far."""
-    limit_px = _MUCH_NOISE_PX
-    with suppress(WorkFailed):
-        limit_px = min(limit_px, _LESS * Epipolar.fitted(detections, np.random.default_rng(0)).sigma_px)
+def _noise_px(detections: Detections) -> float:
+    """Noise of the epipolar geometry, px, though it shows no depth; infinite where there is none."""
+    try:
+        return Epipolar.fitted(detections, np.random.default_rng(0)).sigma_px
+    except WorkFailed:
+        return np.inf
+
+
+def _require_one_pose(detections: Detections, noise_px: float) -> None:
+    """Refuse images of one view that show the pose before that of the other: so their noise is far less.
+
+    noise_px : of the images as they are paired.
+    """
+    limit_px = min(_MUCH_NOISE_PX, _LESS * noise_px)
     left, right = _dense(detections, np.arange(detections.marker.size))
     for late, together in enumerate(((left[1:], right[:-1]), (left[:-1], right[1:]))):
         pairs = Observation(
             detections.pose[1:], detections.marker, detections.q[1:], np.stack(together, axis=1)
         )
-        shifted, noise_px = Detections.of(pairs, "R" * detections.q.shape[1]), np.inf
+        shifted, shifted_px = Detections.of(pairs, "R" * detections.q.shape[1]), np.inf
         with suppress(WorkFailed):
-            noise_px = Epipolar.of(shifted, np.random.default_rng(0)).sigma_px
-        if noise_px < limit_px:
+            shifted_px = Epipolar.of(shifted, np.random.default_rng(0)).sigma_px
+        if shifted_px < limit_px:
             names = [detections.view[v] for v in detections.pair]
             raise WorkFailed(
                 f"each {names[late]} image shows the pose before that of the {names[1 - late]} one, by the "
@@ -86,32 +95,28 @@ def _require_one_pose(detections: Detections) -> None:
 
 
 def _require_one_rig(detections: Detections) -> None:
-    """Refuse images amid which one camera moved."""
-    poses = np.arange(len(detections.q))
-    for order, words in ((poses, "from it on"), (poses[::-1], "before it")):
-        if gone := _misfitting(detections, order):
-            at = detections.pose[gone if words == "before it" else -gone]
+    """Refuse images amid which one camera moved: one half shows a geometry that the other end misfits."""
+    first = np.arange(len(detections.q)) < len(detections.q) // 2
+    for half, backwards in ((first, True), (first[::-1], False)):
+        count = beginning_in(_misfitting(detections, half)[:: -1 if backwards else 1])
+        if count >= _LEAST_MOVED:
+            at, which = (-count, "last") if backwards else (count, "first")
             raise WorkFailed(
-                f"one camera moved at pose {at}, by the epipolar geometry: record again, or remove the "
-                f"{gone} poses {words}"
+                f"one camera moved at pose {detections.pose[at]}, by the epipolar geometry: record again, or "
+                f"remove the {which} {count} poses"
             )
 
 
-def _misfitting(detections: Detections, order: IntArray) -> int:
-    """Number of the last poses, in an order (K,), that misfit the geometry of the first half; 0 for a few."""
-    half = detections.of_poses(np.isin(np.arange(order.size), order[: order.size // 2]))
+def _misfitting(detections: Detections, half: BoolArray) -> BoolArray:
+    """Whether each pose (K,) misfits the geometry of some poses (K,); none where these show none."""
+    K = len(detections.q)
     try:
-        geometry = Epipolar.of(half, np.random.default_rng(0))
+        geometry = Epipolar.of(detections.of_poses(half), np.random.default_rng(0))
     except WorkFailed:
-        return 0
+        return np.zeros(K, dtype=np.bool_)
     off = detections.both & ~geometry.within(detections, OUTLIER)
-    count, wrong = (
-        np.bincount(detections.pose_of[of], minlength=order.size) for of in (detections.both, off)
-    )
-    moved = (wrong > _MISFIT * count)[order[::-1]]
-    share = np.cumsum(moved) / np.arange(1, order.size + 1)
-    gone = int(np.flatnonzero(moved & (share >= _NEARLY_ALL)).max(initial=-1)) + 1
-    return gone if gone >= _LEAST_MOVED else 0
+    count, wrong = (np.bincount(detections.pose_of[of], minlength=K) for of in (detections.both, off))
+    return np.asarray(wrong > _MISFIT * count)
 
 
 def _require_alike(detections: Detections, order: IntArray) -> None:

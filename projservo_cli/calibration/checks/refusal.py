@@ -11,7 +11,7 @@ from projservo_cli.calibration.checks.model_error import describe, stepped
 from projservo_cli.calibration.checks.outliers import MAX_OF_POSE, Outliers, fits_other_joints
 from projservo_cli.calibration.checks.quality import check_model
 from projservo_cli.calibration.checks.validation import cross_validate
-from projservo_cli.calibration.detections import Detections
+from projservo_cli.calibration.detections import Detections, beginning_in
 from projservo_cli.calibration.epipolar import ImageGeometry
 from projservo_cli.calibration.initialization import Search, starting_markers, starts
 from projservo_cli.calibration.lens_estimation import undistorted
@@ -47,8 +47,8 @@ _TYPED = 20
 _STRAIGHT, _SURE = 0.5, 6.0
 # Minimum share that a fit keeps of the motion of each joint and, if it rejects much, of the detections.
 _KEPT = 0.5
-# Poses in a row of which this share, and this number, are rejected at least where something changed.
-_NEARLY_ALL, _WRONG_RUN = 0.9, 5
+# Minimum number of poses in a row that are nearly all rejected where something changed.
+_WRONG_RUN = 5
 # Joints that are farther than this share of their range from the median have moved; so many poses in which
 # several did, and this share of them, are rejected at least where readings are in the wrong order.
 _MOVED, _WRONG_POSES, _WRONG_SHARE = 0.1, 3, 0.5
@@ -265,8 +265,7 @@ def _change(rejected: BoolArray, names: Sequence[str]) -> tuple[int, str]:
     ]
     for where, gone in views:
         for which, row in (("first", gone), ("last", gone[::-1])):
-            share = np.cumsum(row) / np.arange(1, len(row) + 1)
-            count = int(np.flatnonzero(row & (share >= _NEARLY_ALL)).max(initial=-1)) + 1
+            count = beginning_in(row)
             if max(_WRONG_RUN, MUCH * len(row)) <= count < len(row):
                 return count if which == "first" else len(row) - count, (
                     f"the fit rejects nearly all of the {which} {count} poses{where}: the base, a camera, "
