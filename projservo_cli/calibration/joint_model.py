@@ -158,7 +158,7 @@ def fit_joint_model(
         raise WorkFailed(f"no fit with the joint model {names} explains the images: leave some of it out")
     if asked is not None:
         search.require_known(found, chosen)
-    if found.params.curve is None or not len(found.params.curve.terms):  # none is left of those of all joints
+    if found.params.curve is None:
         return None
     before = search.gains
     now = left_out_px(found)
@@ -226,13 +226,14 @@ class _Search:
     ) -> Solution | None:
         """Fit with the curve of some hypotheses, but for some terms, from a fit near it.
 
-        None if none is found, or joints fold.
+        None if none is found, joints fold, or there is no term.
         """
         near = near or self.exact
         before = near.params.curve or NO_CURVE
         known = dict(zip(_keys(before), before.terms[:, 3].tolist(), strict=True))
         every = (key for terms in _terms(chosen, near).values() for key in terms if key not in but)
-        keys = list(dict.fromkeys(every))
+        if not (keys := list(dict.fromkeys(every))):
+            return None
         terms = np.array([[*key, known.get(key, 0.0)] for key in keys]).reshape(-1, 4)
         arms = [before.arm]
         if any(one.kind == "sag" for one in chosen) and not len(before.arm):

@@ -217,12 +217,9 @@ def test_a_curve_that_no_joint_can_have_is_refused(word, types):
 
 def test_a_curve_of_all_joints_of_which_no_term_is_left_is_none(monkeypatch):
     """The scale of a single prismatic joint sets that of the frame."""
-
-    def chosen(search):
-        scale = hypotheses_of(["scale"], "RP", "world")
-        return scale, search.with_curve(scale)
-
-    monkeypatch.setattr(joint_model._Search, "automatic", chosen)
+    scale = hypotheses_of(["scale"], "RP", "world")
+    monkeypatch.setattr(joint_model._Search, "_named", lambda search, fit: scale)
+    monkeypatch.setattr(joint_model, "_gain", lambda before, after: (1.0, 1e9))
     robot = random_robot("P", np.random.default_rng(1), 7)
     seen = robot.observe(trials(robot, 6), 0.1, np.random.default_rng(2))
     found = calibrate(seen, "P", source="recorded", joint_noise=None, joint_model="auto")
