@@ -60,8 +60,8 @@ _PHRASES = {
     "value_error": "{error}",
 }
 
-# Parts of a position that pydantic adds: of a key of a mapping, and of each kind that a value may be of.
-_INNER = re.compile(r"\[key\]|constrained-\w+|(literal|tuple)\[.*")
+# Parts of a position that pydantic adds for each kind that a value may be of.
+_KIND = re.compile(r"constrained-\w+|(literal|tuple)\[.*")
 
 # Values that name files, relative to the configuration.
 _FILES = (
@@ -633,36 +633,53 @@ def _check_options(document: _Document) -> None:
 
 def _translated(model: type[BaseModel], errors: Sequence[ErrorDetails]) -> Iterator[Finding]:
     """Return the findings of pydantic, in words; of a value that may be of several kinds one finding."""
-    places = [tuple(part for part in error["loc"] if not _is_inner(part)) for error in errors]
+    places = [
+        tuple(part for part in error["loc"] if part != "[key]" and not _is_kind(part)) for error in errors
+    ]
     for error, place in list(zip(errors, places, strict=True))[:_MOST]:
         if error["type"] == CONTRADICTIONS:
             yield from error["ctx"]["found"]
             continue
         inside = any(len(other) > len(place) and other[: len(place)] == place for other in places)
-        kinds = [one for one, other in zip(errors, places, strict=True) if other == place]
-        if inside and (error["type"] == "too_short" or _is_inner(error["loc"][-1])):
+        of_kind = _is_kind(error["loc"][-1])
+        if inside and (of_kind or error["type"] == "too_short"):
             continue  # a list counts only its valid entries, and is of its kind
-        if len(kinds) == 1:
+        kinds = [
+            one
+            for one, other in zip(errors, places, strict=True)
+            if other == place and _is_kind(one["loc"][-1])
+        ]
+        if not of_kind or len(kinds) == 1:
             yield place, _phrase(model, error)
         elif error is kinds[0]:
-            yield place, _phrase_of_kinds([_phrase(model, one) for one in kinds], error["input"])
+            wanted = " or ".join(map(_wanted, kinds))
+            yield place, f"must be {wanted}, not {_displayed(error['input'])}"
 
 
-def _is_inner(part: int | str) -> bool:
-    """Whether a part of a position is no key of a configuration: that of a mapping's key, or of a kind."""
-    return isinstance(part, str) and bool(_INNER.fullmatch(part))
+def _is_kind(part: int | str) -> bool:
+    return isinstance(part, str) and bool(_KIND.fullmatch(part))
 
 
-def _phrase_of_kinds(phrases: Sequence[str], given: Any) -> str:
-    """Combine what a value is not, kind by kind."""
-    kinds = [re.sub(r".*; valid: ", "", one).removeprefix("must be ") for one in phrases]
-    words = " or ".join(one.removesuffix(f", not {_displayed(given)}") for one in kinds)
-    return f"must be {words}, not {_displayed(given)}"
+def _wanted(error: ErrorDetails) -> str:
+    """A value of one kind, in words."""
+    words = _words(error)
+    return ", ".join(words) if words else _requirement(error).removeprefix("must be ")
+
+
+def _words(error: ErrorDetails) -> list[str]:
+    """The words of which a value must be one; none where it may be any."""
+    if error["type"] != "literal_error":
+        return []
+    return [word.strip("'") for word in error["ctx"]["expected"].replace(" or ", ", ").split(", ")]
+
+
+def _requirement(error: ErrorDetails) -> str:
+    """Say what a value does not meet."""
+    return _PHRASES.get(error["type"], error["msg"]).format(**error.get("ctx", {}))
 
 
 def _phrase(model: type[BaseModel], error: ErrorDetails) -> str:
     kind, path, given = error["type"], error["loc"], error["input"]
-    context = error.get("ctx", {})
     if kind == "extra_forbidden" or (kind == "model_type" and path and _takes_views(model, path)):
         if path == ("law",):  # else it would have been spelt out
             both = isinstance(given, str)
@@ -670,12 +687,10 @@ def _phrase(model: type[BaseModel], error: ErrorDetails) -> str:
         return f"unknown key; {_nearest(path[-1], sorted(_model_at(model, path[:-1]).model_fields))}"
     if kind == "string_pattern_mismatch":
         return f"{_displayed(given)} must be letters R and P, one a joint"
-    if kind == "literal_error":
-        valid = [option.strip("'") for option in context["expected"].replace(" or ", ", ").split(", ")]
-        return f"{_displayed(given)} is not one of them; {_nearest(given, valid)}"
-    phrase = _PHRASES.get(kind, error["msg"]).format(**context)
+    if words := _words(error):
+        return f"{_displayed(given)} is not one of them; {_nearest(given, words)}"
     plain = isinstance(given, (str, int, float)) or given is None
-    return f"{phrase}, not {_displayed(given)}" if plain and kind != "missing" else phrase
+    return _requirement(error) + (f", not {_displayed(given)}" if plain and kind != "missing" else "")
 
 
 def _displayed(value: Any) -> str:
