@@ -283,11 +283,8 @@ def _reversed(body: _Body, focals: FloatArray) -> list[_Start]:
     """Starts of a body reversed in depth, which orthography sees alike, at each focal length, px."""
     ray, inside_out = body.t / np.linalg.norm(body.t, axis=1, keepdims=True), np.diag([1.0, 1.0, -1.0])
     R = (np.eye(3) - 2.0 * ray[:, :, None] * ray[:, None]) @ body.R @ inside_out
-    deeper = np.array([[1.0, 1.0, focal / body.focal[0]] for focal in focals])
-    return [
-        _Start(R, body.t * by, body.X @ inside_out, focal)
-        for by, focal in zip(deeper, focals.tolist(), strict=True)
-    ]
+    X, unit = body.X @ inside_out, float(body.focal[0])
+    return [_Start(R, body.t * [1.0, 1.0, focal / unit], X, focal) for focal in focals.tolist()]
 
 
 def _flat_starts(images: FloatArray, focals: FloatArray, middle: FloatArray, most: float) -> list[_Start]:

@@ -87,8 +87,9 @@ class TaskImages(NamedTuple):
         """Select the markers of the face, to measure it point by point; incidences need the body."""
         m = self.s_start.shape[1] - self.pins
         s_start, s_star = (np.ascontiguousarray(s[:, :m]) for s in (self.s_start, self.s_star))
-        face = self._replace(s_start=s_start, s_star=s_star, pins=0, body=NO_BODY)
-        return face._replace(incidences=(), s_taught=None)
+        return self._replace(
+            s_start=s_start, s_star=s_star, pins=0, body=NO_BODY, incidences=(), s_taught=None
+        )
 
     def taught(self) -> "TaskImages":
         """Return the task to the pose that was taught."""
