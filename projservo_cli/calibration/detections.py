@@ -198,6 +198,19 @@ class Detections:
         numbers = (np.cumsum(keep) - 1)[left.marker_of]
         return dataclasses.replace(left, marker=self.marker[keep], marker_of=numbers)
 
+    def covering(self, order: IntArray, wanted: int) -> BoolArray:
+        """Mask (m,) of markers, taken in an order until each pose has as many as wanted, seen by the pair."""
+        rows = np.flatnonzero(self.both)
+        count = np.bincount(self.marker_of[rows], minlength=self.marker.size)
+        edge = np.cumsum(count) - count
+        lack, chosen = np.full(len(self.q), wanted), np.zeros(self.marker.size, dtype=np.bool_)
+        for j in order:
+            poses = self.pose_of[rows[edge[j] : edge[j] + count[j]]]
+            if count[j] > 1 and (lack[poses] > 0).any():
+                chosen[j] = True
+                lack[poses] -= 1
+        return chosen
+
     def count_at(self, mask: BoolArray) -> IntArray:
         """Number (K,) of detections in a mask (V, N) at each pose."""
         return np.bincount(self.pose_of, mask.sum(axis=0), len(self.q)).astype(np.int64)

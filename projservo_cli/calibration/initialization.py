@@ -96,23 +96,15 @@ def stationary(detections: Detections, noise_px: float) -> BoolArray:
     return np.asarray(often & (moved <= limit))
 
 
-def starting_markers(detections: Detections, noise_px: float, rng: np.random.Generator) -> BoolArray:
-    """Mask (m,) of markers for the start: moving, seen at many poses, and no more than each pose needs."""
-    m, both = detections.marker.size, detections.both
-    moving = ~stationary(detections, noise_px)
+def starting_markers(detections: Detections, geometry: ImageGeometry, rng: np.random.Generator) -> BoolArray:
+    """Mask (m,) of markers for the start: placed, moving, seen at many poses, and as many as poses need."""
+    m, placed = detections.marker.size, geometry.places(detections)
+    moving = placed & ~stationary(detections, geometry.noise_px)
     if m <= _FEW:
-        return moving if moving.sum() >= _WANTED else np.ones(m, dtype=bool)
-    rows = np.flatnonzero(both)
-    count = np.bincount(detections.marker_of[rows], minlength=m)
-    edge = np.cumsum(count) - count
-    lack = np.full(len(detections.q), _WANTED)
-    chosen = np.zeros(m, dtype=bool)
-    for j in np.lexsort((rng.random(m), -np.minimum(count, np.median(count)), ~moving)):
-        poses = detections.pose_of[rows[edge[j] : edge[j] + count[j]]]
-        if count[j] > 1 and (lack[poses] > 0).any():
-            chosen[j] = True
-            lack[poses] -= 1
-    return chosen
+        return moving if moving.sum() >= _WANTED else placed
+    count = detections.count_of(detections.both[None])
+    order = np.lexsort((rng.random(m), -np.minimum(count, np.median(count)), ~moving))
+    return detections.covering(order[placed[order]], _WANTED)
 
 
 @dataclass(frozen=True, eq=False)

@@ -202,7 +202,7 @@ class Solution:
         follows, own = np.zeros((m, 3, s + offsets)), np.zeros((m, 3, 3))
         for markers, A, B in self._tracks(s + offsets):
             U, size, Vt = np.linalg.svd(B, full_matrices=False)
-            floor = OPEN_DIRECTION * size[:, :1]
+            floor = OPEN_DIRECTION * np.where(size[:, :1] > 0.0, size[:, :1], 1.0)
             U *= (size > floor)[:, None]
             own[markers] = Vt.swapaxes(1, 2) / np.maximum(size, floor)[:, None]
             along = U.swapaxes(1, 2) @ A
@@ -243,6 +243,8 @@ class Solution:
                 A[..., count:] = J[..., -3:]
                 A = A.reshape(len(A), markers.size, length, 2, -1).swapaxes(0, 1)
                 A = A.reshape(markers.size, -1, A.shape[-1])
+                # One detection has fewer numbers than a marker: rows of zeros leave the rest of it open.
+                A = np.pad(A, ((0, 0), (0, max(3 - A.shape[1], 0)), (0, 0)))
                 yield markers, A[..., :count], A[..., count:]
 
 
@@ -617,7 +619,7 @@ def _solve_from_images(search: Search, expected: Expected) -> Solution:
     levels: list[float] = []
     for number, factors in enumerate(_FOCAL_FACTORS):
         # Each pass draws other markers if there are many.
-        few = starting_markers(whole.detections, epipolar.noise_px, search.rng)
+        few = starting_markers(whole.detections, epipolar, search.rng)
         problem = whole if few.all() else whole.of_markers(few)
         search, detections = dataclasses.replace(search, problem=problem), problem.detections
         rows = detections.seen & trusted[detections.pose_of]

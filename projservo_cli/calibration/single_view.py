@@ -32,8 +32,10 @@ from projservo_cli.records import BoolArray, FloatArray, IntArray, WorkFailed
 
 # Focal lengths with which the body is fitted, in image sizes.
 _FOCALS = (0.6, 1.0, 1.7, 3.0, 5.0)
-# Maximum numbers of poses and of markers in the fit, and minimum number of markers of a pose, of poses.
+# Maximum number of poses in the fit, number of markers wanted in each, and minimum numbers of both.
 _POSES, _MARKERS, _LEAST_MARKERS, _LEAST_POSES = 120, 40, 4, 4
+# Golden ratio, whose multiples modulo one spread evenly.
+_GOLDEN = 1.618033988749895
 # Number of poses with more markers than the minimum from which the others stay out of the fit.
 _ENOUGH_POSES = 10
 # Rounds of the factorisation, each of all cameras, then of the shape.
@@ -135,6 +137,10 @@ class RigidBody(ImageGeometry):
         """Relative standard error of the noise."""
         return float(1.0 / np.sqrt(2.0 * self.dof))
 
+    def places(self, detections: Detections) -> BoolArray:
+        """Mask (m,) of the markers in the fit."""
+        return np.isin(detections.marker, self.marker)
+
     def _points(self, detections: Detections, body: _Body) -> FloatArray:
         """Points (N, 3) of observations before the camera, NaN where pose or marker is not in the fit."""
         row = np.full(len(detections.q), -1)
@@ -176,8 +182,10 @@ def _chosen(detections: Detections) -> tuple[IntArray, IntArray, FloatArray, Flo
     weight = np.ones(images.shape[:2])
     weight[detections.pose_of[seen], detections.marker_of[seen]] = detections.weight[0, seen]
     often = np.isfinite(images[..., 0]).sum(axis=0)
-    marker = np.sort(np.argsort(-often, kind="stable")[:_MARKERS])
-    marker = marker[often[marker] >= _LEAST_POSES]
+    # Neighbours show nearly the same: steps of the golden ratio take distant ones of those seen as often.
+    spread = _GOLDEN * np.arange(often.size) % 1.0
+    order = np.lexsort((spread, -often))
+    marker = np.flatnonzero(detections.covering(order[often[order] >= _LEAST_POSES], _MARKERS))
     count = np.isfinite(images[:, marker, 0]).sum(axis=1)
     # A start knows poses of four markers badly, and a fit then falls into minima of these: more, if enough.
     more = np.count_nonzero(count > _LEAST_MARKERS) >= _ENOUGH_POSES

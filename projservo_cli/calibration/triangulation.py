@@ -68,13 +68,14 @@ class Tracks:
     def locate(self, wanted: BoolArray, sigma: float) -> FloatArray:
         """Move the wanted markers (m,) to where most of their detections agree within a noise σ, px.
 
-        Candidates are the current point, and those triangulated from observations by both views.
+        Candidates are the current point, and those triangulated from observations by both views, or from
+        two poses where there is one view.
         """
         detections, M = self.detections, self.params.M[:, :3].copy()
         rows = np.flatnonzero(wanted[detections.marker_of])
         best = np.full(len(M), np.inf)
-        for number in range(-1, _CANDIDATES if len(detections.pair) > 1 else 0):
-            points = M if len(detections.pair) < 2 else self._triangulate(max(number, 0), wanted)
+        for number in range(-1, _CANDIDATES):
+            points = self._triangulate(max(number, 0), wanted)
             if number < 0:  # the current point, else the median of all
                 points = np.where(np.isfinite(M), M, np.nanmedian(np.concatenate([M, points]), axis=0))
             for part, some, marker in self._parts(rows):
@@ -84,7 +85,10 @@ class Tracks:
         return np.hstack([M, np.ones((len(M), 1))])
 
     def _triangulate(self, number: int, wanted: BoolArray) -> FloatArray:
-        """Points (m, 3) triangulated from observation ``number`` of each marker, NaN if it has fewer."""
+        """Points (m, 3) triangulated from observation ``number`` of each marker, NaN if it has fewer.
+
+        One view takes the observation half a track later, too.
+        """
         detections, params = self.detections, self.params
         both = np.flatnonzero(detections.both & wanted[detections.marker_of])
         count = np.bincount(detections.marker_of[both], minlength=len(wanted))
@@ -92,12 +96,15 @@ class Tracks:
         # Spread evenly over the track.
         chosen = np.flatnonzero(count > number)
         step = np.maximum(count[chosen] / _CANDIDATES, 1.0)
-        rows = both[first[chosen] + (number * step).astype(np.int64)]
-        pair = [*detections.pair]
-        pixels = detections.pixels[pair][:, rows]
+        at = (number * step).astype(np.int64)
+        views = detections.pair if len(detections.pair) > 1 else 2 * detections.pair
+        later = 0 if len(detections.pair) > 1 else count[chosen] // 2
+        rows = both[first[chosen] + np.stack([at, (at + later) % count[chosen]])]  # (2, R)
+        pair = np.array(views)[:, None]
+        pixels = detections.pixels[pair, rows]
         if params.lens is not None:
-            pixels = undistort(params.lens[pair], pixels)
-        M = triangulated(params.P[pair][:, None] @ self.motion[detections.pose_of[rows]], homogeneous(pixels))
+            pixels = undistort(params.lens[[*views]], pixels)
+        M = triangulated(params.P[pair] @ self.motion[detections.pose_of[rows]], homogeneous(pixels))
         points = np.full((len(wanted), 3), np.nan)
         points[chosen] = M[:, :3] / M[:, 3:]
         return points

@@ -144,7 +144,7 @@ def joint_at_fault(search: Search, max_px: float, straight: Sequence[int] | None
     straight : joints that alone may be of the other type.
     """
     detections = search.problem.detections
-    few = detections.of_markers(starting_markers(detections, search.epipolar.noise_px, search.rng))
+    few = detections.of_markers(starting_markers(detections, search.epipolar, search.rng))
     changes = _hypotheses(few, search.problem.q_reference)
     if straight is not None:
         changes = [changes[_ORDERS + i] for i in straight]
