@@ -15,7 +15,7 @@ from scipy.optimize import least_squares, minimize_scalar
 from scipy.spatial.transform import Rotation
 from scipy.special import stdtrit
 
-from projservo_cli.calibration.detections import MIN_SIGMA, Detections, deviation, medians
+from projservo_cli.calibration.detections import Detections, deviation, medians
 from projservo_cli.geometry.displacements import homogeneous
 from projservo_cli.image_size import ImageSize, image_sizes
 from projservo_cli.records import BoolArray, FloatArray, IntArray, WorkFailed
@@ -46,6 +46,8 @@ _CORE_STEP = 0.1
 _CORE_OPEN = 10.0
 # Minimum median distance of the right view from a homography of the left one, in units of the noise.
 _MIN_PARALLAX = 3.0
+# Noise over the extent of the markers, below which images are exact: of 0.01 px no detector is better.
+_EXACT = 1e-4
 # Rounds of the search for an isotropic frame.
 _WHITENINGS = 30
 # Maximum number of markers a pose of which all pairs are compared.
@@ -68,14 +70,15 @@ class ImageGeometry(ABC):
 
     sigma_px: float  # noise per image coordinate from the residuals, px
     core: "Core"  # the same noise, robust against many wrong correspondences, and its interval
+    min_px: float  # noise below which images are exact
 
     origin: ClassVar[str]  # of the noise, for messages
     shown: ClassVar[str]  # who shows it, likewise
 
     @property
     def noise_px(self) -> float:
-        """Noise, px per coordinate, at least ``MIN_SIGMA``."""
-        return max(self.sigma_px, MIN_SIGMA)
+        """Noise, px per coordinate, at least ``min_px``."""
+        return max(self.sigma_px, self.min_px)
 
     @property
     @abstractmethod
@@ -161,7 +164,7 @@ class Epipolar(ImageGeometry):
             raise WorkFailed("the observations of the two cameras share no epipolar geometry: check the rows")
         sigma = float(np.sqrt((residual[inlier] ** 2).sum() / (inlier.sum() - _PARAMETERS)))
         parallax = float(np.median(_transfer(a[inlier], b[inlier]) / T_[0, 0]))
-        return cls(sigma, Core.of(residual, pose_of), in_pixels, inlier, parallax)
+        return cls(sigma, Core.of(residual, pose_of), exact_px(left), in_pixels, inlier, parallax)
 
     @property
     def relative_error(self) -> float:
@@ -184,6 +187,11 @@ class Epipolar(ImageGeometry):
             known[detections.both] = points
             found.append((P, known))
         return found
+
+
+def exact_px(pixels: FloatArray) -> float:
+    """Noise of pixels (N, 2), px, below which they are exact, as those projected from estimated poses."""
+    return _EXACT / float(similarity(pixels)[0, 0])
 
 
 class Core(NamedTuple):

@@ -68,9 +68,16 @@ class JointNoise:
 
     @classmethod
     def estimated(
-        cls, problem: LeastSquares, params: Parameters, used: BoolArray, sigma_px: float | None
+        cls,
+        problem: LeastSquares,
+        params: Parameters,
+        used: BoolArray,
+        sigma_px: float | None,
+        min_px: float = 0.0,
     ) -> "JointNoise":
-        """Estimate by maximum likelihood from the detections used (V, N), at a noise of pixels, None for any.
+        """Estimate by maximum likelihood from the detections used (V, N).
+
+        sigma_px : noise of pixels, None for any that is at least ``min_px``.
 
         Zero if it is not significant; that of encoder ticks if readings lie on ticks and the interval
         contains it.
@@ -94,6 +101,8 @@ class JointNoise:
         bounds = log_ratios[max(best - 1, 0)], log_ratios[min(best + 1, _GRID - 1)]
         found = minimize_scalar(likelihood.deviance, bounds=bounds, method="bounded")
         log_ratio, minimum, none = float(found.x), float(found.fun), likelihood.deviance(_NONE)
+        if sigma_px is None and likelihood.sigma(log_ratio) < min_px:
+            return cls.estimated(problem, params, used, min_px)
 
         def beyond(at: float) -> float:
             """Deviance beyond the end of the interval."""

@@ -300,6 +300,11 @@ def _maximum_likelihood(
     cause = ""
     if not expected.known and expected.ratio(solution) > _DOUBTFUL_RATIO:
         cause = joint_at_fault(start, _DOUBTFUL_SHARE * solution.sigma_px)
+    if epipolar.sigma_px < expected.min_px:
+        note = (
+            f"the images have no noise ({epipolar.sigma_px:.2g} px): they were made from poses, whose errors "
+            "no two markers show apart; give the noise of these (--noise-px)"
+        )
     advice = tuple(filter(None, (cause, *result.advice[:1], _worst_view(result), *result.advice[1:], note)))
     if curved is not None and result.joint_curve is not None:
         result = dataclasses.replace(result, joint_curve=np.hstack([result.joint_curve[:, :5], curved.gains]))

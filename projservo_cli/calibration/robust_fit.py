@@ -10,7 +10,13 @@ import numpy as np
 from scipy.special import chdtri
 
 from projservo_cli.calibration.bundle_adjustment import JointErrors, LeastSquares, fit_offsets, minimize
-from projservo_cli.calibration.detections import MAX_JUDGED, RAYLEIGH, even_choice, medians, per_rad
+from projservo_cli.calibration.detections import (
+    MAX_JUDGED,
+    RAYLEIGH,
+    even_choice,
+    medians,
+    per_rad,
+)
 from projservo_cli.calibration.epipolar import OUTLIER, ImageGeometry
 from projservo_cli.calibration.initialization import Nominal, Search, starting_markers, starts
 from projservo_cli.calibration.joint_noise import NO_JOINT_NOISE, JointNoise
@@ -271,6 +277,7 @@ class Expected:
     scale: float | None = None  # true over stated deviations, if the images determine it
     scale_interval: FloatArray | None = None  # (2,) of 95 %
     shown: str = ""  # who shows it, for messages
+    min_px: float = 0.0  # its least, where it is estimated
 
     @classmethod
     def of(
@@ -284,16 +291,18 @@ class Expected:
         if sigma_px is not None:
             return cls(sigma_px, source == "simulated", "that were given", 0.0)
         if stated_px is None:
-            return cls(epipolar.noise_px, False, epipolar.origin, epipolar.relative_error)
+            error = epipolar.relative_error
+            return cls(epipolar.noise_px, False, epipolar.origin, error, min_px=epipolar.min_px)
         origin = "that the sigmas of the markers state"
         if source == "simulated":
             return cls(stated_px, True, origin, _STATED_ERROR)
         low, high = interval = epipolar.core.interval / stated_px
         if low <= 1.0 <= high:
-            return cls(stated_px, False, origin, _STATED_ERROR, 1.0, interval)
+            return cls(stated_px, False, origin, _STATED_ERROR, 1.0, interval, min_px=epipolar.min_px)
         scale = epipolar.core.sigma_px / stated_px
         origin = f"{origin}, times {scale:.3g} (95 %: {low:.3g} to {high:.3g}) as {epipolar.shown}"
-        return cls(scale * stated_px, False, origin, _STATED_ERROR, scale, interval, epipolar.shown)
+        shown, stated = (epipolar.shown, epipolar.min_px), scale * stated_px
+        return cls(stated, False, origin, _STATED_ERROR, scale, interval, *shown)
 
     def require_scale(self, view: Sequence[str]) -> None:
         """Refuse stated deviations that are wrong by more than a detector can explain.
@@ -395,13 +404,20 @@ def _robust_search(
 
 
 def fit_inliers(
-    problem: LeastSquares, params: Parameters, sigma: float, rig_px: float = 0.0, *, hopeless: float = np.inf
+    problem: LeastSquares,
+    params: Parameters,
+    sigma: float,
+    rig_px: float = 0.0,
+    *,
+    hopeless: float = np.inf,
+    min_px: float = 1e-9,
 ) -> Solution | None:
     """Least squares of the inliers, in rounds until they no longer change.
 
     sigma : robust noise of the initial parameters, px; inliers are within 5σ.
     rig_px : noise of the rig, px; a fit that reaches it also tests tracks.
     hopeless : ratio of both above which no rounds follow.
+    min_px : noise of pixels in whose units the offsets of joints count.
     Returns None if the fit leaves no degree of freedom, no detection of a view, or points behind a camera.
     """
     if sigma > hopeless * rig_px:
@@ -410,7 +426,7 @@ def fit_inliers(
         residual, seen = problem.residual(params), problem.detections.seen
         dof = _degrees_of_freedom(problem, params, seen)
         return Solution(problem, params, residual, seen, dof) if dof > 0 else None
-    params, within = _within(problem, params, max(sigma, 1e-9), max(sigma, 1e-9), rig_px)
+    params, within = _within(problem, params, max(sigma, min_px), max(sigma, min_px), rig_px)
     for _ in range(_MASK_ROUNDS):
         used = within
         if not used.any(axis=1).all():
@@ -426,8 +442,8 @@ def fit_inliers(
             return None
         # Wrong detections still among them widen the tail and hardly the middle.
         share = float(np.sqrt(2.0 * np.count_nonzero(used) / dof))
-        middle = max(share * median_px(problem.residual(params), used) / RAYLEIGH, 1e-9)
-        sigma = max(float(np.sqrt(fit.cost / dof)), 1e-9)
+        middle = max(share * median_px(problem.residual(params), used) / RAYLEIGH, min_px)
+        sigma = max(float(np.sqrt(fit.cost / dof)), min_px)
         updated, within = _within(problem, params, sigma, middle, rig_px)
         if np.count_nonzero(used != within) <= _FLICKER * used.size:
             break
@@ -512,13 +528,15 @@ def fit_joint_noise(exact: Solution, expected: Expected, given: float | None) ->
     """
     if given == 0.0 or exact.joint_noise is not None:
         return exact
-    sigma_px, solution = expected.sigma_px if expected.known else None, exact
+    sigma_px, solution = None if expected.min_px else expected.sigma_px, exact
     for _ in range(_NOISE_ROUNDS):
         before = solution.joint_noise
         if given is not None:
             noise = JointNoise(given, None, given / expected.sigma_px)
         else:
-            noise = JointNoise.estimated(solution.problem, solution.params, solution.used, sigma_px)
+            noise = JointNoise.estimated(
+                solution.problem, solution.params, solution.used, sigma_px, expected.min_px
+            )
         if noise.sigma_q == 0.0:
             return dataclasses.replace(exact, joint_noise=noise)
         if before is not None and abs(noise.sigma_q - before.sigma_q) <= _NOISE_SETTLED * before.sigma_q:
@@ -526,7 +544,8 @@ def fit_joint_noise(exact: Solution, expected: Expected, given: float | None) ->
         problem = exact.problem.with_noise(noise.over_pixels * per_rad(exact.problem.detections.prismatic))
         # Start robustly: the exact fit has absorbed some errors of the joints.
         params = minimize(problem, solution.params, solution.used, robust=True, max_steps=20).params
-        found = fit_inliers(problem, params, noise.sigma_q / noise.over_pixels)
+        min_px = sigma_px or expected.min_px
+        found = fit_inliers(problem, params, noise.sigma_q / noise.over_pixels, min_px=min_px)
         if found is None:
             return dataclasses.replace(exact, joint_noise=NO_JOINT_NOISE)
         solution = dataclasses.replace(found, joint_noise=noise)

@@ -18,12 +18,21 @@ from scipy.optimize import least_squares
 from scipy.sparse import csr_array
 from scipy.spatial.transform import Rotation
 
-from projservo_cli.calibration.detections import MAD, MIN_SIGMA, RAYLEIGH, Detections, even_choice
+from projservo_cli.calibration.detections import (
+    MAD,
+    MIN_SIGMA,
+    RAYLEIGH,
+    Detections,
+    cauchy_weights,
+    deviation,
+    even_choice,
+)
 from projservo_cli.calibration.epipolar import (
     OUTLIER,
     Core,
     ImageFrame,
     ImageGeometry,
+    exact_px,
     planar_homography,
     similarity,
 )
@@ -130,7 +139,8 @@ class RigidBody(ImageGeometry):
         sigma = float(np.sqrt((distance[inlier] ** 2).sum() / max(dof - 2 * np.count_nonzero(~inlier), 1)))
         core = Core.of(residual.ravel(), np.repeat(np.nonzero(seen)[0], 2))
         core = Core(factor * core.sigma_px, factor * core.interval)
-        return cls(sigma, core, bodies, pose, detections.marker[marker], dof)
+        min_px = exact_px(detections.pixels[0, detections.seen[0]])
+        return cls(sigma, core, min_px, bodies, pose, detections.marker[marker], dof)
 
     @property
     def relative_error(self) -> float:

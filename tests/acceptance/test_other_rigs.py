@@ -71,3 +71,47 @@ def test_three_webcams_before_a_real_arm(answer, elsewhere, shared_data):
     code, value, error = answer("report", "-o", "out", "calibrate")  # with poses that are left out as a whole
     assert (code, value["report"]["figures"]) == (0, ["figures/fig13_calibration.svg"]), error
     assert not any(text.startswith(("joint ", "check the joint")) for text in found["advice"])
+
+
+def test_one_camera_and_a_board(answer, elsewhere, shared_data):
+    """All 63 corners of a flat board, of which the fit of the body takes a part."""
+    folder = shared_data / "board"
+    tables = "--data", folder / "train.csv", "--readings", folder / "train_joints.csv"
+    code, found, error = answer("calibrate", *tables, "--image-size", "1280x960", "-o", "out")
+    assert (code, found["usable"]) == (0, True), error
+    assert not any(found["rejected"]["tracks"].values())
+    code, value, _ = answer(
+        "validate", "out", "--data", folder / "test.csv", "--readings", folder / "test_joints.csv"
+    )
+    # 0.0553 px a coordinate, at 0.2 px of noise; every second corner alone leaves 0.063.
+    assert (code, value["skipped"]["unknown_marker"]) == (0, 0)
+    assert value["rms_px"] <= 0.09
+
+
+def test_case_32_good_markers_rejected(case, answer):
+    folder = case("32_good_markers_rejected")
+    words = "--mount", "tool", "--joints", "RRPR", "--image-size", "1280x960"
+    code, found, _ = answer("calibrate", "--data", folder / "t.csv", *words, "-o", "out")
+    assert (code, found["usable"], any(found["rejected"]["tracks"].values())) == (0, True, False)
+    code, value, _ = answer("validate", "out", "--data", folder / "held.csv")
+    assert (code, value["skipped"]["unknown_marker"]) == (0, 0)
+
+
+def test_case_34_few_corners_seen(case, answer):
+    folder = case("34_few_corners_seen")
+    words = "--mount", "tool", "--joints", "PPPRRR", "--image-size", "1280x960"
+    code, found, error = answer("calibrate", "--data", folder / "t.csv", *words, "-o", "out")
+    assert "internal error" not in error
+    assert (code, found["usable"]) in ((0, True), (1, False))
+
+
+@pytest.mark.parametrize("stated", [(), ("--noise-px", 0.3)])
+def test_case_30_no_pixel_noise(case, answer, stated):
+    """Images projected from estimated poses: no two markers show the noise, and joints take its errors."""
+    folder = case("30_no_pixel_noise")
+    words = "--joints", "RRRRRR", "--image-size", "1280x960", *stated
+    code, found, error = answer("calibrate", "--data", folder / "t.csv", *words, "-o", "out")
+    assert (code, found["usable"]) == (0, True), error
+    # With 0.1 px added to the pixels, the same table predicts to 0.123 px.
+    assert 0.06 <= found["predicted_rms_px"] <= 0.25
+    assert any(line.startswith("the images have no noise") for line in found["advice"]) == (not stated)
