@@ -47,8 +47,10 @@ _POSES, _MARKERS, _LEAST_MARKERS, _LEAST_POSES = 120, 40, 4, 4
 _GOLDEN = 1.618033988749895
 # Number of poses with more markers than the minimum from which the others stay out of the fit.
 _ENOUGH_POSES = 10
-# Rounds of the factorisation, each of all cameras, then of the shape.
-_ROUNDS = 60
+# Rounds of the factorisation, each of all cameras, then of the shape; the first ones, of least squares.
+_ROUNDS, _PLAIN_ROUNDS = 80, 20
+# Minimum noise of a factorisation over the extent of the markers in an image, of which perspective is a part.
+_AFFINE = 0.005
 # Minimum depth of a shape over its width in the frame of a factorisation, which noise may take below zero.
 _FLAT = 0.02
 # Distance from a homography, over the extent of the markers in the image, up to which a body is flat.
@@ -234,24 +236,47 @@ def _explaining(
 def _factorised(images: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Affine cameras A (K, 2, 3) and b (K, 2), and a shape (m, 3), of images (K, m, 2), NaN if unseen.
 
-    By alternating least squares, since markers are missing.
+    By alternating least squares from the markers that are seen together most often, since others are missing,
+    and under a Cauchy loss, since some are wrong.
     """
-    seen = np.isfinite(images[..., 0]).astype(np.float64)
-    known = np.nan_to_num(images)
-    center = (known * seen[..., None]).sum(axis=1) / seen.sum(axis=1)[:, None]
-    rows = ((known - center[:, None]) * seen[..., None]).swapaxes(1, 2).reshape(-1, images.shape[1])
-    X = np.linalg.svd(rows, full_matrices=False)[2][:3].T * np.sqrt(images.shape[1])
-    for _ in range(_ROUNDS):
+    seen, known = np.isfinite(images[..., 0]), np.nan_to_num(images)
+    placed = _together(seen)
+    whole = seen[:, placed].all(axis=1)
+    block = known[whole][:, placed]
+    rows = (block - block.mean(axis=1, keepdims=True)).swapaxes(1, 2).reshape(-1, np.count_nonzero(placed))
+    X = np.zeros((images.shape[1], 3))
+    X[placed] = np.linalg.svd(rows, full_matrices=False)[2][:3].T * np.sqrt(np.count_nonzero(placed))
+    loss, extent = np.ones(seen.shape), float(np.abs(rows).mean())
+    for number in range(_ROUNDS):
+        weight = loss * (seen & placed)
+        posed = np.count_nonzero(weight, axis=1) >= _LEAST_MARKERS
         H = np.hstack([X, np.ones((len(X), 1))])
-        G = np.einsum("kj,ja,jb->kab", seen, H, H) + 1e-9 * np.eye(4)
-        C = np.linalg.solve(G, np.einsum("kj,ja,kjc->kac", seen, H, known))
+        G = np.einsum("kj,ja,jb->kab", weight, H, H) + 1e-9 * np.eye(4)
+        C = np.linalg.solve(G, np.einsum("kj,ja,kjc->kac", weight, H, known))
         A, b = C[:, :3].swapaxes(1, 2), C[:, 3]
-        G = np.einsum("kj,kca,kcb->jab", seen, A, A)
+        weight = loss * (seen & posed[:, None])
+        placed = np.count_nonzero(weight, axis=0) >= _LEAST_POSES
+        G = np.einsum("kj,kca,kcb->jab", weight, A, A)
         G += 1e-12 * np.trace(G, axis1=1, axis2=2).max() * np.eye(3)
-        right = np.einsum("kj,kca,kjc->ja", seen, A, known - b[:, None])
-        X = np.linalg.solve(G, right[..., None])[..., 0]
-        X -= X.mean(axis=0)
+        right = np.einsum("kj,kca,kjc->ja", weight, A, known - b[:, None])
+        X = np.where(placed[:, None], np.linalg.solve(G, right[..., None])[..., 0], 0.0)
+        X -= X[placed].mean(axis=0) * placed[:, None]
+        if number >= _PLAIN_ROUNDS:
+            off = np.linalg.norm(np.einsum("kca,ja->kjc", A, X) + b[:, None] - known, axis=2)
+            width = 2.0 * deviation(off[seen & placed], _AFFINE * extent)
+            loss = cauchy_weights((off / width) ** 2)
     return A, b, X
+
+
+def _together(seen: BoolArray) -> BoolArray:
+    """Mask (m,) of a few markers that most poses (K, m) show at once."""
+    chosen, whole = np.zeros(seen.shape[1], dtype=np.bool_), np.ones(len(seen), dtype=np.bool_)
+    for _ in range(_LEAST_MARKERS + 1):
+        count = np.where(chosen, -1, np.count_nonzero(seen & whole[:, None], axis=0))
+        if (best := int(np.argmax(count))) >= 0 and count[best] >= _LEAST_POSES:
+            chosen[best] = True
+            whole &= seen[:, best]
+    return chosen
 
 
 def _upgraded(A: FloatArray, X: FloatArray) -> tuple[FloatArray, FloatArray]:
