@@ -125,13 +125,15 @@ def main():
     asked = parser_of("boards", __doc__, [("draws", 20, "of boards")]).parse_args()
     if (SHARED / "board").is_dir():
         print("reference table: {:.4f} px rms a coordinate, {} of 63 corners kept".format(*reference()))
-    rows = list(in_two_processes(judged, range(asked.draws), "boards"))
-    write_rows(asked.output, rows)
-    for row in rows:
+    rows = []
+    for row in in_two_processes(judged, range(asked.draws), "boards"):
+        rows.append(row)
         print(
             "draw {draw}: {mount}, {corners} corners, flat {flat}, usable {usable}, {kept} kept, error "
-            "{error_px:.4f} px, bound {bound_px:.4f} px {reason}".format_map(row)
+            "{error_px:.4f} px, bound {bound_px:.4f} px {reason}".format_map(row),
+            flush=True,
         )
+    write_rows(asked.output, rows)
     ratio = np.array([row["error_px"] / row["bound_px"] for row in rows if row["usable"]])
     whole = sum(row["usable"] and row["kept"] == row["corners"] for row in rows)
     print(
