@@ -40,6 +40,9 @@ _PART_STEP = math.radians(2.5)
 _ROUND_OFF = 1e-13
 # Bisections of a step until its end is at a limit, below round-off of a joint reading.
 _HALVINGS = 48
+# Share of the joint-speed limit aimed at where a solved step is beyond it: joint motion is not quite
+# proportional to the amplitude.
+_AIM = 0.999
 # Length of a part over its prediction above which it is on another kinematic branch.
 _BRANCH_FACTOR = 2.0
 
@@ -135,7 +138,7 @@ def _first_order(step: _Step, state: State) -> float:
 
 
 @internal
-def _continued(model: Model, task: Task, q: FloatArray, step: _Step, state: State) -> bool:
+def _continued(model: Model, task: Task, q: FloatArray, step: _Step, settled: float, state: State) -> bool:
     """Solve the displacement in equal parts, each from the previous one, into ``state.path``.
 
     The first-order step in ``state.q_dot`` predicts the first part, the previous part the others. A part more
@@ -157,7 +160,7 @@ def _continued(model: Model, task: Task, q: FloatArray, step: _Step, state: Stat
         if following(task.reference) and not follows_joint_path(task.reference):
             ahead = planned_step(model, task.reference, float(state.clock[0]), step.ahead * j / count)
             goal = mul(ahead, goal)
-        if not reach(model, face, goal, state.path[j], state.work, SETTLED):
+        if not reach(model, face, goal, state.path[j], state.work, settled):
             return False
         taken = 0.0
         for i in range(n):
@@ -166,6 +169,22 @@ def _continued(model: Model, task: Task, q: FloatArray, step: _Step, state: Stat
         if taken > _BRANCH_FACTOR * _BRANCH_FACTOR * predicted + _ROUND_OFF * _ROUND_OFF:
             return False
     return True
+
+
+@merged
+def _within_speed(gains: Gains, q: FloatArray, end: FloatArray, seconds: float, state: State) -> float:
+    """Write the velocity of a joint step from q to its end; the share of it within the joint-speed limit."""
+    for i in range(q.shape[0]):
+        state.q_dot[i] = (end[i] - q[i]) / seconds
+    return speed_share(state.q_dot, gains.limits.speed, 1.0)
+
+
+@merged
+def _solved(model: Model, task: Task, gains: Gains, q: FloatArray, step: _Step, state: State) -> float:
+    """Solve a displacement in its parts and write its velocity; the share within the limit, 0 if unsolved."""
+    if not _continued(model, task, q, step, SETTLED, state):
+        return 0.0
+    return _within_speed(gains, q, state.path[step.pieces], gains.period * gains.scale, state)
 
 
 @merged
@@ -188,7 +207,7 @@ def _up_to_limit(model: Model, task: Task, gains: Gains, q: FloatArray, step: _S
     for _ in range(_HALVINGS):
         trial = _scaled(step, share + width, step.pieces)
         _first_order(trial, state)
-        if _continued(model, task, q, trial, state):
+        if _continued(model, task, q, trial, SETTLED, state):
             joint = _blocked_joint(q, state.path[step.pieces], gains)
             if joint < 0:
                 share += width
@@ -197,7 +216,7 @@ def _up_to_limit(model: Model, task: Task, gains: Gains, q: FloatArray, step: _S
         width *= 0.5
     last = _scaled(step, share, step.pieces)
     _first_order(last, state)
-    if share == 0.0 or not _continued(model, task, q, last, state):
+    if share == 0.0 or not _continued(model, task, q, last, SETTLED, state):
         for j in range(step.pieces + 1):
             for i in range(q.shape[0]):
                 state.path[j, i] = q[i]
@@ -209,11 +228,11 @@ def _up_to_limit(model: Model, task: Task, gains: Gains, q: FloatArray, step: _S
 def exact(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, state: State) -> int:
     """Joint velocity whose step moves the face by exp(λ_t τ T Ĥ_t) exp(λ_s θ_s T Ĥ_s) exactly.
 
-    The joint-speed limit shortens the amplitude along the path, by the first-order joint step, before any
-    Newton step, and a position limit ends the step on it: the path itself never changes. Long steps are
-    solved in parts of about 2.5°, or if a part fails in more, up to 128. Across a singularity, where no part
-    can be solved, the law takes the first-order step. Where every command is scaled, that share of the
-    displacement is solved, since that of the joint step would leave the path.
+    The joint-speed limit shortens the amplitude along the path: by the first-order joint step, before any
+    Newton step, then by the solved one. A position limit ends the step on it: the path itself never changes.
+    Long steps are solved in parts of about 2.5°, or if a part fails in more, up to 128. Across a singularity,
+    where no part can be solved, the law takes the first-order step. Where every command is scaled, that share
+    of the displacement is solved, since that of the joint step would leave the path.
 
     With a plan, the displacement is that of the plan in the next period after the correction of the face.
     Along a joint-space path the joints of the plan lead, and the first-order correction is added.
@@ -235,26 +254,41 @@ def exact(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, 
         for i in range(q.shape[0]):
             state.q_dot[i] /= gains.period
         return OK
-    share = speed_share(state.q_dot, gains.limits.speed, gains.period)
+    share, seconds = speed_share(state.q_dot, gains.limits.speed, gains.period), gains.period * gains.scale
+    if share < 1.0:
+        # One Newton step tells how far the solved step is beyond the limit.
+        step = _scaled(whole, share * gains.scale, 1)
+        _first_order(step, state)
+        _continued(model, task, q, step, math.inf, state)
+        left = _within_speed(gains, q, state.path[1], seconds, state)
+        if left < 1.0:
+            share *= max(_AIM * left, 1.0 / _BRANCH_FACTOR)
     step = _scaled(whole, share * gains.scale, 1)
     largest = _first_order(step, state)
     count = min(MAX_PARTS, max(1, math.ceil(largest / _PART_STEP)))
-    step = _scaled(step, 1.0, count)
-    while not _continued(model, task, q, step, state):
-        if count == MAX_PARTS:
-            # Across a singularity only the first-order step remains.
-            _first_order(step, state)
-            for i in range(q.shape[0]):
-                state.q_dot[i] /= gains.period * gains.scale
-            state.share[0], state.parts[0], state.blocked[0] = share, 0, -1
-            return OK
-        count = min(MAX_PARTS, 2 * count)
-        step = _scaled(step, 1.0, count)
+    left = _solved(model, task, gains, q, _scaled(step, 1.0, count), state)
+    while left < 1.0:
+        if left > 0.0:
+            share *= _AIM * left
+        elif count < MAX_PARTS:
+            count = min(MAX_PARTS, 2 * count)
+        else:
+            break
+        step = _scaled(whole, share * gains.scale, count)
+        _first_order(step, state)
+        left = _solved(model, task, gains, q, step, state)
+    if left == 0.0:
+        # Across a singularity only the first-order step remains.
+        _first_order(step, state)
+        for i in range(q.shape[0]):
+            state.q_dot[i] /= seconds
+        state.share[0], state.parts[0], state.blocked[0] = share, 0, -1
+        return OK
     state.blocked[0] = _blocked_joint(q, state.path[count], gains)
     if state.blocked[0] >= 0:
+        step = _scaled(whole, share * gains.scale, count)
         share *= _up_to_limit(model, task, gains, q, step, state)
-    for i in range(q.shape[0]):
-        state.q_dot[i] = (state.path[count, i] - q[i]) / (gains.period * gains.scale)
+        _within_speed(gains, q, state.path[count], seconds, state)
     state.share[0] = share
     state.parts[0] = count
     return OK

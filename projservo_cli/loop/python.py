@@ -317,17 +317,18 @@ def _send(
 ) -> None:
     """Send a joint step (n,), or the parts that the law split it into where they lead as far.
 
-    A law that keeps to its path bounds its joint steps to first order only; what one exceeds the limit by
-    costs time instead of leaving the path.
+    Each part takes as long as the joint-speed limit asks of it, and its share of the time that is left. Parts
+    in which joints take turns may ask for more than the period.
     """
     path = _optional(law, "path")
     in_parts = (
         len(path) > 2 and plant.takes_parts and np.allclose(path[-1] - path[0], dq, rtol=0.0, atol=1e-9)
     )
     steps = np.diff(path, axis=0) if in_parts else dq[None].copy()
-    for step in steps:
-        minimum = float(np.max(np.abs(step) / (limits.speed * scale)))
-        plant.command(step, max(period / len(steps), minimum))
+    shortest = np.max(np.abs(steps) / (limits.speed * scale), axis=1)
+    left = max(0.0, period - float(shortest.sum())) / len(steps)
+    for step, seconds in zip(steps, shortest.tolist(), strict=True):
+        plant.command(step, seconds + left)
 
 
 def _optional(law: LoopLaw, name: str) -> Any:

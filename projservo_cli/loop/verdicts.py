@@ -276,7 +276,9 @@ def bounded(log: Log, k: int, asked: Command, plant: Plant, limits: Limits) -> i
     """
     q_dot = asked.q_dot
     dq = log.scratch[0, : q_dot.shape[0]]
-    log.factor[k] = asked.share if asked.share >= 0.0 else limit_speed(q_dot, limits.speed)
+    log.factor[k] = limit_speed(q_dot, limits.speed)
+    if asked.share >= 0.0:
+        log.factor[k] *= asked.share
     for i in range(q_dot.shape[0]):
         q_dot[i] *= asked.scale
         dq[i] = q_dot[i] * asked.period

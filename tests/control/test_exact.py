@@ -41,8 +41,8 @@ def test_the_limit_shortens_the_way_and_never_bends_it():
     trace = exact_run("paper", 0.5, "125", "stop.max_steps=6")
     assert trace.speed_limited_steps == 6
     assert trace.center_deviation_at_samples_mm < 1e-7
-    # The limit holds for the first-order step; the exact one differs by its second order.
-    assert np.degrees(np.abs(np.diff(trace.q, axis=0)).max()) < 6.0
+    # It is kept by the step as it is solved, and all but used up.
+    assert 4.99 < np.degrees(np.abs(np.diff(trace.q, axis=0)).max()) <= 5.0 * (1.0 + 1e-9)
 
 
 def test_parts_of_a_step_are_sent_only_when_asked_for():

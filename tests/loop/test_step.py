@@ -115,10 +115,11 @@ def test_speed_is_limited_by_uniform_scaling(rng):
         assert q_dot == pytest.approx(factor * given, rel=1e-15)
         assert (np.abs(q_dot) <= speed * (1 + 1e-15)).all()
         assert factor == pytest.approx(min(1.0, (speed / np.abs(given)).min()), rel=1e-15)
-    # Slow commands, endless limits, and a law that keeps the limit itself.
-    for given, share in (([0.1, -1e9], -1.0), ([0.0, 0.0], -1.0), ([7.0, 0.0], 0.3)):
+    # Slow commands, endless limits, and laws that applied the limit themselves, or say so.
+    slow = ([0.1, -1e9], -1.0, 1.0), ([0.0, 0.0], -1.0, 1.0), ([0.1, 0.0], 0.3, 0.3), ([0.2, 0.0], 0.3, 0.15)
+    for given, share, expected in slow:
         _, factor, q_dot = command(given, share=share, speed=np.array([0.1, math.inf]))
-        assert (factor, q_dot.tolist()) == (abs(share), given)
+        assert (factor, q_dot.tolist()) == (expected, [min(given[0], 0.1), given[1]])
 
 
 def test_a_step_is_shortened_to_the_first_limit():
