@@ -14,6 +14,10 @@ from projservo_cli.passwords import masked
 from projservo_cli.progress import Listener
 
 _UNSEEN = re.compile("[\x00-\x09\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
+_MEASURED = {  # words for the image features of runs
+    "body": "all markers",
+    "points": "those of the face alone",
+}
 _NOTES = {  # on runs, and their reasons
     "unplanned": "driven without a plan",
     "untested": "images were not tested against the calibration",
@@ -368,6 +372,10 @@ def _of_laws(value: dict[str, Any], _: bool) -> Iterator[str]:
             f"{first:>9}{second:>9}"
             f"{hidden:>5}{''.join(f'/{steps}' for steps in others):<4}{last:>10}"
         ).rstrip()
+    by = {kind: [named(one) for one in value["laws"] if one["features"] == kind] for kind in _MEASURED}
+    if all(by.values()):
+        parts = (f"{said} by {', '.join(by[kind])}" for kind, said in _MEASURED.items())
+        yield wrapped(f"measured: {'; '.join(parts)}", "  ")
     for trace in value["laws"]:
         if trace["incidences"]:
             rest = ", ".join(map(_incidence, trace["incidences"]))
