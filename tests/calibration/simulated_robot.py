@@ -10,8 +10,8 @@ from projservo_cli.records import FloatArray, Observation
 from tests.samples import prismatic, revolute
 
 IMAGE_SIZE = (1280, 1024)
-NAMES = ("left", "right", "top", "low")  # of the views
-PLACES = ((-0.5, 0.0), (0.5, 0.0), (0.1, 1.3), (-0.2, -0.9))  # of the cameras, in baselines
+NAMES = ("left", "right", "top", "low", "side")  # of the views
+PLACES = ((-0.5, 0.0), (0.5, 0.0), (0.1, 1.3), (-0.2, -0.9), (1.4, 0.3))  # of the cameras, in baselines
 
 
 @dataclass(frozen=True, eq=False)
