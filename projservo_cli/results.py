@@ -227,7 +227,8 @@ class ImageModel(Displayable, Calibration):
         ``count`` of marker-view pairs; ``rms_px``, ``median_px``, ``p95_px`` of their Euclidean distances,
         None without a pair; ``stated_px``, the median error that the covariance states there, ``noise_px`` of
         these images, and ``limit_px``, three times both together, above which the median contradicts the
-        calibration; ``skipped`` by why.
+        calibration; ``views``, with the ``view``, ``count``, ``median_px`` and ``limit_px`` of each, which
+        show a camera that moved; ``skipped`` by why.
 
         Raises
         ------

@@ -331,7 +331,7 @@ def _validate(
 
     Compares the pixels of an observation table (--data) with those the calibration of a run predicts at the
     table's joint readings. Ends in exit code 1 where their median distance passes three times the stated
-    error and the noise of the images together.
+    error and the noise of the images together, or where that of one camera shows that it was moved.
 
     With --metric it compares positions that another instrument measured, such as a laser tracker. Its scale,
     its pose and the place of its point on the tool are fitted to --fit.
@@ -391,13 +391,29 @@ def _validate(
         "{limit_px:.3g} px allowed: 3 times the stated error of {stated_px:.3g} px and the noise of these "
         "images, {noise_px:.3g} px, together".format_map(value)
     )
-    console.report(value, [*words, wrapped(f"median {allowed}", "  ")])
-    if value["median_px"] > value["limit_px"]:
-        raise WorkFailed(
-            f"{data}: the images contradict the calibration: median {value['median_px']:.3g} px, {allowed}; "
-            "check that these are the same robot, rig and markers, with joints in the same units; if so, "
-            "calibrate again with such poses among the others"
-        )
+    words.append(wrapped(f"median {allowed}", "  "))
+    beyond = [one for one in value["views"] if one["count"] and one["median_px"] > one["limit_px"]]
+    of_view = "{view} camera: median {median_px:.3g} px of {count} pairs, {limit_px:.3g} px allowed"
+    if beyond:
+        words += [wrapped(of_view.format_map(one), "  ") for one in value["views"] if one["count"]]
+    console.report(value, words)
+    if not beyond and value["median_px"] <= value["limit_px"]:
+        return
+    reason = "the images contradict the calibration"
+    remedy = (
+        "check that these are the same robot, rig and markers, with joints in the same units; if so, "
+        "calibrate again with such poses among the others"
+    )
+    passed = f"median {value['median_px']:.3g} px, {allowed}"
+    if value["median_px"] <= value["limit_px"] or len(beyond) < len(value["views"]):
+        passed = "; ".join(map(of_view.format_map, beyond)) or passed
+    if 0 < len(beyond) < len(value["views"]):
+        moved, *others = (one["view"] for one in beyond)
+        remedy = f"if it moved, fit it again: projservo calibrate {target} --refit {moved} --data {data}"
+        reason += " in some cameras alone" if others else " in one camera alone"
+    raise WorkFailed(
+        "; ".join(filter(None, (f"{data}: {reason}: {passed}", remedy, calibration.order_advice)))
+    )
 
 
 def _position_errors(

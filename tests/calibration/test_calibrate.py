@@ -141,6 +141,23 @@ def test_limit_of_held_out_images_takes_their_own_noise(known):
         assert contradicted["median_px"] > contradicted["limit_px"]
 
 
+@pytest.mark.parametrize("missed", [0.0, 0.8])
+def test_a_camera_that_turned_passes_the_limit_of_its_own_view(known, missed):
+    """The pooled median hides it: by rows that it lacks, or by the noise that it is smaller than."""
+    robot, _, calibration = known
+    rng = np.random.default_rng(11)
+    fresh = robot.observe(around(robot, 40, rng), 0.3, rng)
+    fresh.images[rng.random(40) < missed, 1] = np.nan
+    sound = residual_statistics(calibration, fresh)
+    for one in sound["views"]:
+        assert one["median_px"] < one["limit_px"]
+    assert sum(one["count"] for one in sound["views"]) == sound["count"]
+    fresh.images[:, 1] += [8.0 * sound["stated_px"], 6.0 * sound["stated_px"]]
+    left, right = residual_statistics(calibration, fresh)["views"]
+    assert left == sound["views"][0]
+    assert right["median_px"] > right["limit_px"]
+
+
 def readings_at(robot, q):
     return Detections.of(robot.observe(q, 0.0, np.random.default_rng(0)), robot.joint_types)
 

@@ -142,6 +142,10 @@ def statistics(monkeypatch):
         "stated_px": 0.3,
         "noise_px": 0.4,
         "limit_px": 1.5,
+        "views": [
+            {"view": "left", "count": 2, "median_px": 0.25, "limit_px": 1.5},
+            {"view": "right", "count": 0, "median_px": None, "limit_px": None},
+        ],
         "skipped": {"unknown_marker": 1, "behind_camera": 0, "missing": 3},
     }
     monkeypatch.setattr(validation, "residual_statistics", lambda *_: value)

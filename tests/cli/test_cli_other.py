@@ -30,6 +30,16 @@ def test_validate_prints_the_statistics_of_a_table(projservo, reported, statisti
         answer = projservo("validate", "out", "--data", "t.csv", "--json")
         assert (answer.code, answer.json["median_px"]) == (code, median)
         assert ("median 1.51 px, 1.5 px allowed" in answer.err) == (code == 1)
+    statistics["median_px"], (left, right) = 0.25, statistics["views"]
+    assert "left camera" not in projservo("validate", "out", "--data", "t.csv").out  # sound: no line a view
+    right |= {"count": 1, "median_px": 2.0, "limit_px": 1.2}  # of fewer rows, which the pooled median hides
+    answer = projservo("validate", "out", "--data", "t.csv")
+    assert (answer.code, "left camera: median 0.25 px of 2 pairs, 1.5 px" in answer.out) == (1, True)
+    assert "right camera: median 2 px of 1 pairs, 1.2 px allowed" in " ".join(answer.err.split())
+    assert "projservo calibrate out --refit right --data t.csv" in " ".join(answer.err.split())
+    assert "left camera" not in answer.err
+    left |= {"median_px": 1.6}  # both: no camera alone
+    assert "--refit" not in projservo("validate", "out", "--data", "t.csv").err
     statistics["limit_px"] = None  # as of a method without covariance, which states no error
     assert projservo("validate", "out", "--data", "t.csv", "--json").code == 0
     (tmp_path / "one.csv").write_text("pose,marker,q1,u_left,v_left,u_right,v_right\n0,0,1,2,3,4,5\n")

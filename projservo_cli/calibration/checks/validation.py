@@ -42,6 +42,10 @@ _MIN_READINGS = 4
 _OPEN = "the other poses do not determine the robot"
 # Median held-out error, in the stated error and the noise of the images together, from which it contradicts.
 _CONTRADICTED = 3.0
+# Variance of a median of normal numbers over that of their mean.
+_MEDIAN = 0.5 * np.pi
+# Median length of a normal error in the plane over its rms.
+_MEDIAN_LENGTH = float(np.sqrt(np.log(2.0)))
 # Minimum number of correspondences whose epipolar geometry determines their noise within a seventh.
 _NOISE_PAIRS = 32
 
@@ -288,8 +292,9 @@ def residual_statistics(calibration: Calibration, observation: Observation) -> d
     observation : stereo images of the same robot, px; poses in motion do not count.
     Returns ``count``; ``rms_px``, ``median_px``, ``p95_px`` (None without a pair); ``stated_px``, the median
     error that the covariance states at these readings, ``noise_px`` of these images and readings, and
-    ``limit_px`` of the median by both (None without a covariance); ``skipped``, the numbers of pairs of
-    unknown markers, behind the camera, and missing; ``advice`` about placeholders, which are missing ones.
+    ``limit_px`` of the median by both (None without a covariance); ``views``, the ``view``, ``count``,
+    ``median_px`` and ``limit_px`` of each; ``skipped``, the numbers of pairs of unknown markers, behind the
+    camera, and missing; ``advice`` about placeholders, which are missing ones.
     Raises InputError if the readings have another number of joints or are not finite.
     """
     observation = of_views(observation.at_rest, calibration.view)
@@ -305,19 +310,33 @@ def residual_statistics(calibration: Calibration, observation: Observation) -> d
     seen: BoolArray = np.asarray(np.isfinite(images).all(axis=-1))
     ahead = np.isfinite(pixels[..., 0])
     compared = seen[:, :, known] & ahead
-    found = _distance_statistics(np.linalg.norm((pixels - observation.images[:, :, known])[compared], axis=1))
+    off = np.where(compared[..., None], observation.images[:, :, known] - pixels, np.nan)
+    distance = np.linalg.norm(off, axis=-1)
+    found = _distance_statistics(distance[compared])
+    views = [_distance_statistics(distance[:, v][compared[:, v]]) for v in range(len(calibration.view))]
     stated = noise = limit = None
+    limits: list[float | None] = [None] * len(views)
     if found["count"] and np.isfinite(calibration.sqrt_cov_shared).all():
-        of_pairs = prediction_variance(calibration, observation.q).sum(axis=-1)[:, :, order][compared]
-        stated, noise = float(np.sqrt(np.median(of_pairs))), _image_noise(calibration, observation)
-        if sigma_q := calibration.sigma_q:  # these readings have their own noise
-            J = joint_derivative(calibration, observation.q)[:, :, order] * per_rad(calibration.prismatic)
-            noise = float(np.hypot(noise, sigma_q * np.sqrt(np.median((J**2).sum(axis=(-2, -1))[compared]))))
+        of_pairs = prediction_variance(calibration, observation.q).sum(axis=-1)[:, :, order]
+        J = joint_derivative(calibration, observation.q)[:, :, order] * per_rad(calibration.prismatic)
+        # These readings have their own noise.
+        of_readings = (calibration.sigma_q or 0.0) ** 2 * (J**2).sum(axis=(-2, -1))
+        of_images = _image_noise(calibration, observation)
+        stated = float(np.sqrt(np.median(of_pairs[compared])))
+        noise = float(np.hypot(of_images, np.sqrt(np.median(of_readings[compared]))))
         limit = _CONTRADICTED * float(np.hypot(stated, noise))
+        own = calibration.sigma_view_px if calibration.sigma_view_px is not None else np.zeros(len(views))
+        for v in np.flatnonzero(compared.any(axis=(0, 2))).tolist():
+            variances = (float(np.median(part[:, v][compared[:, v]])) for part in (of_pairs, of_readings))
+            limits[v] = _limit_of_view(off[:, v], max(of_images, float(np.sqrt(2.0) * own[v])), *variances)
     return found | {
         "stated_px": stated,
         "noise_px": noise,
         "limit_px": limit,
+        "views": [
+            {"view": name, "count": one["count"], "median_px": one["median_px"], "limit_px": allowed}
+            for name, one, allowed in zip(calibration.view, views, limits, strict=True)
+        ],
         "skipped": {
             "unknown_marker": int(seen[:, :, ~known].sum()),
             "behind_camera": int((seen[:, :, known] & ~ahead).sum()),
@@ -325,6 +344,25 @@ def residual_statistics(calibration: Calibration, observation: Observation) -> d
         },
         "advice": list(advice),
     }
+
+
+def _limit_of_view(off: FloatArray, noise: float, stated: float, of_readings: float) -> float:
+    """Limit, px, of the median length of differences (K, m, 2) from predicted pixels; NaN unseen.
+
+    A camera that turned shifts all its images alike. The median over poses averages the noise out of the
+    shift, so the limit is the median that the largest shift by the stated error and by chance would leave.
+    noise : Euclidean, px; stated, of_readings : variances of the pixels by the covariance, by readings, px².
+    """
+    seen = off[np.isfinite(off[..., 0]).any(axis=1)]
+    centers = np.nanmedian(seen, axis=1)
+    shift = np.median(centers, axis=0)
+    between = float(np.median(np.linalg.norm(centers - shift, axis=1))) / _MEDIAN_LENGTH
+    of_poses = max(between**2, of_readings) / len(seen)
+    chance = max(_MEDIAN**2 * noise**2 / float(np.isfinite(seen[..., 0]).sum()), _MEDIAN * of_poses)
+    largest = _CONTRADICTED**2 * (stated + chance)
+    left = float(np.nanmedian(np.linalg.norm(seen, axis=-1))) ** 2 - float(shift @ shift)
+    together = _CONTRADICTED**2 * (stated + noise**2 + of_readings)
+    return float(np.sqrt(min(together, max(left, 0.0) + largest)))
 
 
 def of_views(observation: Observation, names: tuple[str, ...]) -> Observation:
