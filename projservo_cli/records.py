@@ -576,6 +576,8 @@ class Calibration(StatedErrors, Rejections, FitQuality, ProjectiveKinematics):
     usable: bool = _scalar(about="whether the calibration is usable for control")
     reason: str = _scalar(about="reason why it is usable or not")
     advice: tuple[str, ...] = _scalar(about="remedies, one sentence each")
+    limit: str = _scalar(about="factor that limits the predictions", default="")
+    notes: tuple[str, ...] = _scalar(about="those of the remedies that mend nothing but noise", default=())
     seconds: float = _scalar("s", "computing time")
     time_offset_s: FloatArray | None = _optional_array(
         "view", "s", "time of a joint reading less the time of its image"

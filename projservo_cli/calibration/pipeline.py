@@ -415,9 +415,9 @@ def _record(
     method = "closed_form" if errors is None else "bundle_adjustment"
     problem, detections, params = solution.problem, solution.problem.detections, result.params
     outlier = outlier_rows(detections, detections.seen & ~solution.used & ~found.explained)
-    counts = (len(outlier), len(found.suspect) + len(found.poses), len(found.id_switches))
+    counts = len(found.suspect) + len(found.poses), len(found.id_switches)
     moved = describe_moved(detections, found.moved)
-    verdict = assess(solution, errors, expected, counts, suspicion, limit_px)
+    verdict = assess(solution, errors, expected, outlier, counts, suspicion, limit_px)
     check = verdict.check
     if errors is None:
         m, unknown = len(params.M), np.full(params.P.size + params.H_hat.size, np.nan)
@@ -441,6 +441,8 @@ def _record(
         joint_types=letters_of(detections.prismatic),
         usable=verdict.usable,
         reason=verdict.reason,
+        limit=verdict.limit,
+        notes=verdict.notes,
         advice=(f"{moved}: images that disagree are rejected; fix the cameras", *verdict.advice)
         if moved
         else verdict.advice,

@@ -135,7 +135,7 @@ def _of_recording(value: dict[str, Any], _: bool) -> Iterator[str]:
 
 def _of_calibration(value: dict[str, Any], detailed: bool) -> Iterator[str]:
     px, bound = (_number(value[f"predicted_{name}_px"]) for name in ("rms", "p99"))
-    sound = value["usable"] and value["reason"].endswith(_SOUND) and all(map(_OF_NOISE, value["advice"]))
+    sound = value["usable"] and {*value["advice"]} <= {*value["notes"]}
     asked = (
         detailed
         or value["lens"]
@@ -144,7 +144,9 @@ def _of_calibration(value: dict[str, Any], detailed: bool) -> Iterator[str]:
         or len(value["joints"]) == 1
     )
     if sound and value["predicted_rms_px"] is not None and not asked:
-        yield f"calibrate: usable: predicts images to {px} px rms, 99 % below {bound}; more: -v"
+        limit = "" if value["limit"] == "noise" else f" limited by {value['limit']};"
+        found = f"predicts images to {px} px rms, 99 % below {bound};{limit} more: -v"
+        yield wrapped(f"calibrate: usable: {found}")
         if value["time_offset_s"] is not None:
             yield wrapped(f"time offset {', '.join(_time_offsets(value))}", "  ")
     else:
@@ -161,13 +163,6 @@ def _of_calibration(value: dict[str, Any], detailed: bool) -> Iterator[str]:
             "  ",
         )
     yield from _of_suggestions(value)
-
-
-# Ends of reasons, and advice, that tell of noise alone, which is nothing to mend.
-_SOUND = ("limited by noise", "limited by joint readings")
-_OF_NOISE = re.compile(
-    r"errors of joint readings move|look for joint readings that lag|\d+ observations? (was|were) rejected"
-).match
 
 
 def _in_detail(value: dict[str, Any]) -> Iterator[str]:

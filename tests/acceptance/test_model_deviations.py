@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 
+from projservo_cli.cli import run
+
 # Of each table its options, and what is named: kind, joints and view, any where None.
 TABLES = {
     "20_model_error/gear_all_hobby_0.97": ((), ("scale", (1, 2, 3, 4, 5), "")),
@@ -41,5 +43,22 @@ def test_tracks_of_a_turntable_are_usable_though_a_fifth_drifts(answer, shared_d
         "calibrate", "--data", shared_data / "dinosaur" / "train.csv", "--joints", "R", "-o", "out"
     )
     assert (code, found["usable"]) == (0, True)
-    assert found["reason"].endswith("limited by outliers")
+    assert "limited by outliers: " in found["reason"]
+    assert found["limit"] in found["reason"]
     assert np.isfinite(found["predicted_rms_px"])
+
+
+@pytest.mark.parametrize(
+    ("case", "joints", "limit"),
+    [
+        ("39_marker_on_a_link", "RRRRR", "limited by outliers: 16 of 360, all of marker 3; more: -v"),
+        ("42_lead_screw", "PPPRR", "limited by joint readings, which move images by 0.577 px; more: -v"),
+    ],
+)
+def test_a_short_summary_names_the_limit(shared_data, tmp_path, capsys, case, joints, limit):
+    """Cases 39 and 42: the summary was that of a sound table."""
+    table = shared_data.parent / "cases" / case / "table.csv"
+    if not table.exists():
+        pytest.skip(f"{table} is absent")
+    assert run(["calibrate", "--data", str(table), "--joints", joints, "-o", str(tmp_path / "out")]) == 0
+    assert limit in " ".join(capsys.readouterr().out.split())

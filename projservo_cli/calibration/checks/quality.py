@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import bdtrc
 
 from projservo_cli.calibration.bundle_adjustment import LeastSquares
 from projservo_cli.calibration.checks.model_error import ModelCheck, describe, examine
@@ -28,6 +29,8 @@ from projservo_cli.records import BoolArray, Errors, FloatArray, IntArray, WorkF
 UNDETERMINED_NOISE = 1000.0
 # Share of rejected observations above which outliers limit a fit.
 _MAX_OUTLIERS = 0.05
+# Probability by chance that as many outliers are of one marker, pose or view, below which it is named.
+_CHANCE = 1e-3
 # Noise of predictions at the reach, in units of the pixel noise, above which a joint is poorly observable.
 WEAK_NOISE = 3.0
 # Number of poses at which predictions are assessed.
@@ -201,20 +204,24 @@ class _Assessment:
     usable: bool
     reason: str  # why it is usable or not, and its limiting factor
     advice: tuple[str, ...]  # next steps, first about the limiting factor
+    limit: str  # its limiting factor
+    notes: tuple[str, ...]  # advice that noise alone gives, with nothing to mend
 
 
 def assess(
     solution: Solution,
     errors: Errors | None,
     expected: Expected,
-    rejected: tuple[int, int, int],
+    outlier: IntArray,
+    rejected: tuple[int, int],
     suspicion: str,
     max_predicted_px: float = np.inf,
 ) -> _Assessment:
     """Assess a fit.
 
     errors : of its parameters; None for the closed form, which has none.
-    rejected : numbers of outliers, of suspect joint readings and of exchanged marker numbers.
+    outlier : (L, 3) rejected observations: pose, marker, index of the view (their number for all).
+    rejected : numbers of suspect joint readings and of exchanged marker numbers.
     suspicion : likely cause if residuals exceed pixel noise.
     max_predicted_px : effect of deviations from the model on predictions above which it is not usable.
     Raises WorkFailed naming a joint that moves no image, or whose operator is not determined.
@@ -258,36 +265,41 @@ def assess(
     if errors is None and warned:
         # A method for comparison returns its result all the same.
         short = f"the closed_form method explains the images only to {found}"
-        return _Assessment(
-            span, noise, error, None, False, f"{short}, {share:.3g} times {wanted}: use bundle_adjustment", ()
-        )
+        reason = f"{short}, {share:.3g} times {wanted}: use bundle_adjustment"
+        return _Assessment(span, noise, error, None, False, reason, (), "the method", ())
     reason = f"residuals of {found} agree with {wanted}"
     if warned:
         reason = f"more than pixel noise is left: residuals of {found} are {share:.3g} times {wanted}"
         if "joint readings" in suspicion and not (check and check.errors):
             advice.insert(0, "look for joint readings that lag behind the images")
-    outliers, suspects, swaps = rejected
-    limit, many = "noise", outliers > _MAX_OUTLIERS * solution.used.shape[1]
+    (suspects, swaps), notes = rejected, []
+    outliers, observations = len(outlier), solution.used.shape[1]
+    limit, many = "noise", outliers > _MAX_OUTLIERS * observations
+    alike = _describe_shared(outlier, solution.problem.detections)
     what = "1 observation was rejected as an outlier"
     if outliers != 1:
         what = f"{outliers} observations were rejected as outliers"
-    outlier_advice = f"{what}: check the detection of markers"
+    outlier_advice = f"{what}{alike}: check the detection of markers"
     if many:
         advice.append(outlier_advice)
     if words := _describe_joint_noise(solution):
         reason = f"{reason}, with joint readings off by {words}"
         over, moved_px = solution.joint_effect()
         if over > 1.0:
-            limit = "joint readings"
-            moved = f"move images by {moved_px:.3g} px, more than pixel noise"
-            advice.append(f"errors of joint readings {moved}: finer or stiffer joints would help")
+            moved = f"move images by {moved_px:.3g} px"
+            limit = f"joint readings, which {moved}"
+            notes = [
+                f"errors of joint readings {moved}, more than pixel noise: finer or stiffer joints would help"
+            ]
+            advice += notes
+    of_outliers = f"outliers: {outliers} of {observations}{alike}"
     if warned or suspicion == "lens":
-        limit = suspicion
+        limit = of_outliers if suspicion == "outliers" else suspicion
     elif weak.any():
         few = span[weak] < np.where(prismatic[weak], REACH_M, REACH_RAD)
         limit = "amplitude" if few.any() else "geometry"
-    elif many:
-        limit = "outliers"
+    elif many or alike:
+        limit = of_outliers
     usable = True
     if check is not None and check.errors:
         sentences = [describe(one, prismatic) for one in check.errors]
@@ -305,7 +317,23 @@ def assess(
         advice.append(f"{times} a marker was seen under the number of another: check the numbering")
     if outliers and not many:
         advice.append(outlier_advice)
-    return _Assessment(span, noise, error, check, usable, f"{reason}; limited by {limit}", tuple(advice))
+        notes.append(outlier_advice)
+    reason = f"{reason}; limited by {limit}"
+    return _Assessment(span, noise, error, check, usable, reason, tuple(advice), limit, tuple(notes))
+
+
+def _describe_shared(outlier: IntArray, detections: Detections) -> str:
+    """Name the marker, pose or view of most outliers (L, 3), if that is no chance; empty otherwise."""
+    V = len(detections.view)
+    several = ((1, "marker", detections.marker.size), (0, "pose", detections.pose.size), (2, "view", V))
+    for column, kind, count in several:
+        values, counts = np.unique(outlier[:, column], return_counts=True)
+        most = int(counts.max(initial=0))
+        if 2 * most > len(outlier) and bdtrc(most - 1, len(outlier), 1.0 / count) < _CHANCE:
+            value = int(values[np.argmax(counts)])
+            name = (*detections.view, "all")[value] if kind == "view" else value
+            return f", {'all' if most == len(outlier) else most} of {kind} {name}"
+    return ""
 
 
 def _describe_joint_noise(solution: Solution) -> str:
