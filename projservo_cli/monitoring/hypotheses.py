@@ -68,6 +68,7 @@ class Explanation(NamedTuple):
     left: float  # χ² that stays
     changed_px: float  # by how much it changes images of the markers that it touches, rms
     min_px: float  # the same in the second view, or in the only one
+    seen_px: float  # length of this change that the images show, rms: errors of joints take none of it
 
     @property
     def score(self) -> float:
@@ -259,8 +260,10 @@ class Evidence:
             fell, theta, here, square = square - less, theta + halved, there, less
             if fell < _FALLS:
                 break
-        change = np.square(here - self.at_first).reshape(*self.seen.shape, 2).sum(axis=-1)
+        shift = self.at_first - here
+        change = np.square(shift).reshape(*self.seen.shape, 2).sum(axis=-1)
         changed_px = float(np.sqrt(change[change > 0.0].mean())) if change.any() else 0.0
+        share = float((self.at_first * shift).sum() / max(float(change.sum()), 1e-12))
         by_view = change.sum(axis=(0, 2)) / np.maximum(self._touched(cause).sum(axis=(0, 2)), 1)
         return Explanation(
             cause=cause,
@@ -270,6 +273,7 @@ class Evidence:
             left=square,
             changed_px=changed_px,
             min_px=float(np.sqrt(np.sort(by_view)[-min(2, len(by_view))])),
+            seen_px=share * changed_px,
         )
 
 
@@ -458,6 +462,7 @@ def together(moved: list[Explanation]) -> Explanation:
         left=first.left - sum(fit.gain for fit in moved[1:]),
         changed_px=max(fit.changed_px for fit in moved),
         min_px=min(fit.min_px for fit in moved),
+        seen_px=max(fit.seen_px for fit in moved),
     )
 
 

@@ -488,8 +488,9 @@ class ImageMonitor:
     def _message(self, fits: list[Explanation]) -> str:
         """Sentence on the fault by the likeliest of causes."""
         residual = self._kept[-1].residual
-        rms = np.sqrt(np.square(residual.r).sum() / max(2.0 * residual.seen.sum(), 1.0))
-        off = f"images are {rms:.3g} px rms per coordinate off their prediction by the calibration"
+        square = np.square(residual.r).reshape(len(residual.seen), -1).sum(axis=1)
+        rms = np.sqrt(square / np.maximum(residual.seen.sum(axis=1), 1)).max()  # of the view that is most off
+        off = f"images are {rms:.3g} px rms off their prediction by the calibration"
         if not self._explains(fits[0]):
             return f"{off}, most {self._where(residual)}, and no single cause explains it; recalibrate"
         # A mirrored reading near zero is a small slip: with backlash, images do not separate them.

@@ -72,7 +72,7 @@ def sentence(explanation: Explanation, calibration: Calibration) -> str:
         each=_listed([f"the {names[v]}" for v, shown in enumerate(views) if v != shown]) + " camera",
         was="was" if len(views) == 1 else "were",
         it="it" if len(views) == 1 else "them",
-        px=f"{explanation.changed_px:.2g} px",
+        px=f"{explanation.seen_px:.2g} px",
         ms=" and ".join(f"{1e3 * value:+.3g}" for value in explanation.theta),
         first=first,
         percent=100.0 * first,
@@ -99,7 +99,7 @@ def _moved(explanation: Explanation, calibration: Calibration) -> str:
     """
     moved = sorted(int(calibration.marker[j]) for j in explanation.cause.markers)
     listed, where = ", ".join(map(str, moved)), PLACE[calibration.mount]
-    by = f"by {explanation.changed_px:.2g} px"
+    by = f"by {explanation.seen_px:.2g} px"
     by += ", or is covered in part" if len(calibration.view) == 1 else ""
     tag = moved[0] // CORNERS
     if len(moved) == CORNERS and moved[-1] // CORNERS == tag:

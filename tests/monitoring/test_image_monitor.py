@@ -73,6 +73,16 @@ def arm():
     return Arm(calibrate.run(config)[1], scene, model.q_reference, truth.image_size)
 
 
+@pytest.fixture(scope="module")
+def sharp():
+    """The arm at a tenth of the noise, with joint readings that err by 0.6 px."""
+    config = configured("ur5", f"noise.calibration_px={0.1 * SIGMA}")
+    truth = truth_of(config)
+    scene = Parameters(truth.model.P, truth.model.H_hat_0, truth.model.prismatic, truth.M)
+    made = Arm(calibrate.run(config)[1], scene, truth.model.q_reference, truth.image_size)
+    return made.with_joint_noise(5e-4)
+
+
 def look(test, k, q, s):
     """What a test says of still joints (n,) and images (V, m, 2)."""
     still, new = np.zeros((len(s), len(q))), np.ones(len(s), dtype=bool)
@@ -378,3 +388,31 @@ def test_the_verdict_does_not_depend_on_the_unit_of_pixels():
         found.append(first_alarm(Arm(calibration, None, None, None), q, unit * s, sigma=unit * SIGMA))
         assert "the left camera was moved" in found[-1][1]
     assert abs(found[0][0] - found[1][0]) <= 2  # what counts as standing still is in pixels
+
+
+@pytest.mark.parametrize("moved", ["camera", "tool", "marker"])
+def test_sizes_are_lengths_of_shifts_in_the_image(sharp, moved):
+    """Errors of joints that images allow take no part of a size, nor do its coordinates or still views."""
+    q, _ = sharp.way(3)
+    before, which = sharp.images(at_once(q)), {"marker": [4]}.get(moved, slice(None))
+
+    def shifted(far):
+        if moved == "camera":
+            return before + far * np.where(np.arange(2) == 0, 1.0, 0.0)[:, None, None] * [0.6, 0.8]
+        M = np.repeat(sharp.scene.M[None], len(q), 0)
+        M[:, which, :3] += far * np.array([1.0, 0.5, 0.0]) * M[:, which, 3:]
+        return sharp.images(at_once(q), M)
+
+    def size(far):
+        off = np.linalg.norm(shifted(far) - before, axis=-1)[20:24, :, which]
+        return np.sqrt(np.square(off[off > 0.0]).mean())
+
+    for px in (1.5, 5.0):
+        s = shifted(px * 1e-4 / size(1e-4))
+        s[:20] = before[:20]
+        _, said = first_alarm(sharp, q, noisy(s, 3, 0.05), sigma=0.05)
+        assert moved in said or px < 5.0, said  # small ones look like joints that slipped
+        assert float(re.search(r", by ([0-9.]+) px", said)[1]) == pytest.approx(px, rel=0.1)
+        if moved != "marker":
+            off = re.search(r"images are ([0-9.]+) px rms off", said)[1]
+            assert float(off) == pytest.approx(px, rel=0.1)
