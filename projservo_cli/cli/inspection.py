@@ -197,6 +197,7 @@ def _in_metres(
 
     from projservo_cli.config import load_config
     from projservo_cli.config.inputs import joints_of
+    from projservo_cli.metric.frame import MetricParameters
     from projservo_cli.metric.kinematic_errors import contradictions, kinematic_words
     from projservo_cli.metric.opencv import opencv_cameras
     from projservo_cli.records import TOOL, WorkFailed
@@ -226,8 +227,10 @@ def _in_metres(
     if metric.mount == TOOL:
         value["mount"] = metric.mount
         words += [f"{view} camera {metric.summary()[f'{view} camera']}" for view in metric.view]
+    found = opencv_cameras(metric, calibration)
+    if to in ("urdf", "ros"):  # poses of the cameras whose matrices are those of opencv
+        metric = dataclasses.replace(metric, bodies=MetricParameters(*(part[None] for part in found.body)))
     if to == "opencv":
-        found = opencv_cameras(metric, calibration)
         value |= {"delta_chi2": found.delta_chi2, "lens_rms_px": found.lens_rms_px}
         words.insert(0, f"cameras without skew cost Δχ² {found.skew_chi2:.3g} (2 on average)")
         if calibration.lens is not None:

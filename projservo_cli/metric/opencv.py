@@ -48,7 +48,7 @@ def opencv_cameras(metric: Metric, calibration: Calibration) -> OpenCV:
     """
     K, of_K = metric.K, metric.deviations("K")
     skew = of_K[..., 1]
-    e = -skew @ np.linalg.solve(skew.T @ skew, K[:, 0, 1])  # the maximum-likelihood errors that undo it
+    e = -np.linalg.pinv(skew.T) @ K[:, 0, 1]  # the maximum-likelihood errors that undo it
     change = {name: np.tensordot(e, metric.deviations(name), 1) for name in _MOVED}
     K[:, (0, 0, 0, 1, 1), (0, 1, 2, 1, 2)] += np.tensordot(e, of_K, 1)
     lens = metric.lens.copy()

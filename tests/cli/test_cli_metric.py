@@ -1,18 +1,23 @@
 """Files in metres, read by other people's code, and positions against a table: from the command line."""
 
+import dataclasses
 import json
 import runpy
 import sys
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
 
 from projservo_cli.cli import run
+from projservo_cli.metric.frame import MetricParameters
 from projservo_cli.metric.opencv import opencv_cameras
 from projservo_cli.records import InputError
 from projservo_cli.results import ImageModel
+from projservo_cli.simulation.urdf import urdf_chain
 from projservo_cli.store import run_file
 
 ONES = np.ones(6)
@@ -69,12 +74,33 @@ def test_opencv_reads_the_cameras_and_projects_as_the_model_that_was_fitted(ur5,
     np.testing.assert_allclose(stereo, (right @ np.linalg.inv(left))[:3], atol=1e-12)
 
 
+def test_urdf_and_opencv_are_one_fit(ur5, metric, tmp_path):
+    """Arm and cameras of the URDF, with the matrices for OpenCV, project the markers as OpenCV's rig does."""
+    found = opencv_cameras(metric, run_file.load(ur5).calibration)
+    file = export(ur5, tmp_path, "urdf")
+    arm, root = urdf_chain(str(file), "tool", file.read_bytes()), ElementTree.parse(file)
+    poses = [
+        body.tool_poses(metric.prismatic, Q)
+        for body in (found.body, found.body._replace(axes=arm.axes, tool=arm.tip))
+    ]
+    one, other = (found.body.markers @ T[:, :3, :3].swapaxes(1, 2) + T[:, None, :3, 3] for T in poses)
+    for v, view in enumerate(metric.view):
+        origin = root.find(f"joint[@name='camera_{view}_fixed']/origin")
+        place, turns = (np.array(origin.get(name).split(), dtype=float) for name in ("xyz", "rpy"))
+        rays = (other.reshape(-1, 3) - place) @ Rotation.from_euler("xyz", turns).as_matrix()
+        m = rays @ found.body.intrinsics()[v].T
+        expected = found.body.pixels(one.reshape(-1, 3))[:, v]  # without distortion
+        np.testing.assert_allclose(m[:, :2] / m[:, 2:], expected, atol=1e-6)
+
+
 def pixels_at(metric, tool):
     return metric.body.pixels(metric.markers @ tool[:3, :3].T + tool[:3, 3])
 
 
 def test_mujoco_reads_the_arm_and_predicts_the_same_pixels(ur5, metric, tmp_path):
     mujoco = pytest.importorskip("mujoco")
+    body = opencv_cameras(metric, run_file.load(ur5).calibration).body
+    metric = dataclasses.replace(metric, bodies=MetricParameters(*(part[None] for part in body)))
     model = mujoco.MjModel.from_xml_path(str(export(ur5, tmp_path, "urdf")))
     data = mujoco.MjData(model)
     for q in Q:
