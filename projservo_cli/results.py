@@ -106,7 +106,9 @@ class WrittenReport(Displayable, Report):
         held = [claim["holds"] for claim in self.claims]
         found = {"figures": f"{len(self.figures)} files", "omitted": f"{len(self.omitted)}"}
         if held:
-            found["claims"] = f"{held.count(True)} hold, {held.count(False)} do not, of {len(held)}"
+            found["claims"] = (
+                f"{held.count(True)} hold, {held.count(False)} do not, {held.count(None)} not judged"
+            )
         failing = [claim["claim"] for claim in self.claims if claim["holds"] is False]
         return found | ({"do not hold": ", ".join(failing)} if failing else {})
 

@@ -393,12 +393,14 @@ def _incidence(row: dict[str, Any]) -> str:
 def _of_report(value: dict[str, Any], detailed: bool) -> Iterator[str]:
     claims = value["claims"]
     explained = [claim for claim in claims if detailed or claim["holds"] is False]
-    holding = sum(claim["holds"] is True for claim in claims)
-    held = f"; {holding} of {len(claims)} claims hold" if claims else ""
+    found = [claim["holds"] for claim in claims]
+    judged, left = len(found) - found.count(None), found.count(None)
+    held = f"; {found.count(True)} of {judged} judged claims hold" if claims else ""
+    held += f", {left} not judged" if left else ""
     but = "; it does not hold that" if explained and not detailed else ""
     count = len(value["figures"])
-    yield f"report: {count} file{'s' * (count != 1)} of figures{held}{but}"
-    words = {True: "holds", False: "does not hold", None: "not measured"}
+    yield wrapped(f"report: {count} file{'s' * (count != 1)} of figures{held}{but}")
+    words = {True: "holds", False: "does not hold", None: "not judged"}
     for claim in explained:
         if detailed:
             yield wrapped(f"{words[claim['holds']]}: {claim['claim']}: {claim['measured']}", "  ")
