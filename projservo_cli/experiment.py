@@ -3,8 +3,9 @@
 A chain stops at the first failure and keeps finished results; results that are up to date stay.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -60,7 +61,11 @@ class Experiment(Printed):
         return made
 
     def make(
-        self, *stages: str, laws: Sequence[str] = (), force: bool = False, blind: bool = False
+        self,
+        *stages: str,
+        laws: Sequence[str | Callable[[Any], Any]] = (),
+        force: bool = False,
+        blind: bool = False,
     ) -> "Experiment":
         """Make stages, and those before them that they need; results that are up to date stay.
 
@@ -69,7 +74,8 @@ class Experiment(Printed):
         Parameters
         ----------
         *stages : of ``calibrate``, ``plan``, ``servo`` and ``report``, in their order.
-        laws : instead of ``control.laws``: names or ``module:Class``.
+        laws : instead of ``control.laws``: names, ``module:Class``, or what ``servo`` takes, such as
+            ``laws=["exact", MyLaw]``.
         force : whether named stages are made even if they are up to date.
         blind : whether a robot may move although cameras show no marker of the calibration.
 
@@ -246,14 +252,14 @@ def plan_scene_of(config: Config, calibration: Calibration) -> PlanScene:
     )
 
 
-def _targets(laws: Sequence[str]) -> tuple[str, ...]:
+def _targets(laws: Sequence[str | Callable[[Any], Any]]) -> tuple[str, ...]:
     """Laws each once, registered names as the classes they stand for; an InputError where there is none."""
     given = [laws] if isinstance(laws, str) or not np.iterable(laws) else laws
     for law in given:
-        if not isinstance(law, str):
-            named = f", such as {plugins.class_name(law)!r}" if callable(law) else ""
-            raise InputError(f"make: law {law!r:.60}: give the name of a law, or module:Class{named}")
-    return tuple(dict.fromkeys(map(law_target, given)))
+        if not (isinstance(law, str) or callable(law)):
+            raise InputError(f"make: law {law!r:.60}: give the name of a law, module:Class, or a class")
+    targets = (law_target(law) if isinstance(law, str) else plugins.bring("law", law) for law in given)
+    return tuple(dict.fromkeys(targets))
 
 
 def law_target(name: str) -> str:

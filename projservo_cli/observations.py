@@ -178,6 +178,82 @@ class Observations(Displayable, Observation):
         known = {"joint_types": types, "image_size": image_size, "noise_px": noise_px, "mount": mount}
         return cls.of(observation, **known)
 
+    @classmethod
+    def concat(cls, parts: Sequence["Observations"]) -> "Observations":
+        """Return the poses of several observations one after the other, numbered from 0.
+
+        Parameters
+        ----------
+        parts : observations by the same cameras, as in ``Observations.concat([trials, more])``. Markers that
+            one lacks are unseen there; the seed is that of the first.
+
+        Raises
+        ------
+        InputError
+            If there are none, or they differ in views, joints, or another property or column.
+        """
+        if not parts:
+            raise InputError("concat: an empty list; give observations")
+        marker = np.unique(np.concatenate([part.marker for part in parts]))
+        columns: dict[str, list[Any]] = {}
+        motions = 0  # which are numbered on
+        for part in parts:
+            require_observations("concat", part)
+            own = {field.name: getattr(part, field.name) for field in dataclasses.fields(cls)}
+            own |= {"marker": marker, "seed": parts[0].seed}
+            for name in ("images", "sigma"):
+                if (values := own[name]) is not None:
+                    own[name] = np.full((*values.shape[:2], len(marker), *values.shape[3:]), np.nan)
+                    own[name][:, :, np.searchsorted(marker, part.marker)] = values
+            if part.moving is not None:
+                own["moving"], motions = (
+                    part.moving + motions * (part.moving > 0),
+                    motions + part.moving.max(),
+                )
+            for name, values in own.items():
+                columns.setdefault(name, []).append(values)
+        joined: dict[str, Any] = {"pose": np.arange(sum(map(len, columns["pose"]))), "marker": marker}
+        for name, values in columns.items():
+            shapes = {np.shape(one)[1:] if isinstance(one, np.ndarray) else one for one in values}
+            if len(shapes) > 1:
+                raise InputError(f"concat: the observations differ in {name}: join those alike")
+            if name not in joined and isinstance(values[0], np.ndarray):
+                joined[name] = np.concatenate(values)
+        return dataclasses.replace(parts[0], **joined)
+
+    def select(self, **which: Any) -> "Observations":
+        """Return the observations of some views, poses or markers.
+
+        Parameters
+        ----------
+        **which : ``view``, ``pose`` and ``marker``, each one or a list, as in
+            ``observations.select(view="left", pose=observations.pose[:20])``; by default all.
+
+        Raises
+        ------
+        InputError
+            If one is not among them.
+        """
+        if unknown := {*which} - {"view", "pose", "marker"}:
+            raise InputError(f"select: {min(unknown)}: choose view, pose or marker")
+        changed: dict[str, Any] = {f.name: getattr(self, f.name) for f in dataclasses.fields(Observation)}
+        for name, asked in which.items():
+            wanted = list(asked) if np.iterable(asked) and not isinstance(asked, str) else [asked]
+            known = list(changed[name])
+            if not wanted or {*wanted} - {*known} or len({*wanted}) < len(wanted):
+                raise InputError(f"select: {name} {asked!r:.60}: choose among {known!r:.80}, each once")
+            at = [known.index(one) for one in (sorted(wanted) if name == "marker" else wanted)]
+            for field in dataclasses.fields(Observation):
+                dims, values = field.metadata.get("dims") or (), changed[field.name]
+                if name in dims and values is not None:
+                    changed[field.name] = np.take(values, at, axis=dims.index(name))
+            if name == "view":
+                changed["view"] = tuple(wanted)
+                sizes: Any = self.image_size
+                if np.ndim(sizes or 0) == 2:
+                    changed["image_size"] = tuple(sizes[v] for v in at)
+        return dataclasses.replace(self, **changed)
+
     def to_frame(self) -> Any:
         """Return the observation table as a pandas table; an InputError without pandas."""
         return pandas().read_csv(io.StringIO(table_text(self, mount=self.mount)))

@@ -141,9 +141,10 @@ def class_name(given: Any) -> str:
 
 
 def bring(kind: str, given: Any) -> str:
-    """Make a class that this process has be found by its name, which is returned."""
+    """Make a class, or a function, that this process has be found by its name, which is returned."""
     target = class_name(given)
-    require_object(kind, target, given)
+    if isinstance(given, type):  # what a function makes is checked when it has made it
+        require_object(kind, target, given)
     _BROUGHT[target] = given
     return target
 

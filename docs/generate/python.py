@@ -20,8 +20,8 @@ from projservo_cli.sweeps.statistics import Study
 
 # What Python users call, in the order of a run, and the members of each class.
 INTERFACE: dict[Any, tuple[str, ...]] = {
-    Config: ("load", "from_dict", "replace"),
-    Observations: ("from_arrays", "from_frame", "to_frame"),
+    Config: ("load", "from_dict", "replace", "pose", "plot"),
+    Observations: ("from_arrays", "from_frame", "concat", "select", "to_frame"),
     api.simulate: (),
     api.record: (),
     api.calibrate: (),
@@ -36,7 +36,7 @@ INTERFACE: dict[Any, tuple[str, ...]] = {
     api.plan: (),
     api.servo: (),
     api.sweep: (),
-    Study: ("table", "traces", "failures", "success", "paired", "to_frame", "to_xarray"),
+    Study: ("table", "traces", "failures", "success", "paired", "plot", "to_frame", "to_xarray"),
     Experiment: ("make", "servo", "results", "calibration", "plan", "traces", "at_step", "report"),
     api.load: (),
     records.InputError: (),

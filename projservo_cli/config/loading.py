@@ -16,19 +16,21 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, TypeVar
 
+import numpy.typing as npt
 import yaml
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from projservo_cli.config.sweep import SweepConfig
 from projservo_cli.config.whole import Settings
-from projservo_cli.display import plain
+from projservo_cli.display import checked_array, plain, require_radians
 from projservo_cli.files import bytes_of, text_of
 from projservo_cli.passwords import masked
-from projservo_cli.records import InputError
+from projservo_cli.records import FloatArray, InputError
 from projservo_cli.settings.control import RENDERED, RenderedOptions
 from projservo_cli.settings.sections import CONTRADICTIONS, Finding, Root
 from projservo_cli.settings.task import CURRENT
+from projservo_cli.simulation.described import arm_of
 from projservo_cli.simulation.mjcf import read_mjcf
 from projservo_cli.simulation.urdf import read_urdf
 
@@ -329,6 +331,50 @@ class Config(Settings):
             With a line for each value that does not fit, as for ``--set``.
         """
         return load_config(self.name, overrides_of("replace", values), text=to_yaml(self))
+
+    def pose(self, q: npt.ArrayLike) -> FloatArray:
+        """Return the true pose of the simulated arm's tool in its base frame, before any calibration.
+
+        Parameters
+        ----------
+        q : (n,) joint readings, rad or m, as in ``config.pose(observations.q[0])``.
+
+        Returns
+        -------
+        (4, 4) pose, m.
+
+        Raises
+        ------
+        InputError
+            If the configuration describes no arm, or the readings have another shape or look like degrees.
+        """
+        if self.arm is None:
+            raise InputError("pose: the configuration describes no arm: set robot.dh or robot.screws")
+        return arm_of(self.arm).pose(self._readings("pose", q))
+
+    def plot(self, q: npt.ArrayLike) -> Any:
+        """Draw the simulated arm, its face and the cameras at joints, before any plan.
+
+        Parameters
+        ----------
+        q : (n,) joint readings, rad or m, as in ``config.plot(observations.q[0])``.
+
+        Raises
+        ------
+        InputError
+            If the configuration lacks arm, rig or markers, or the readings have another shape.
+        """
+        from projservo_cli.config.inputs import truth_of
+        from projservo_cli.report import figures  # so that those who draw nothing need not import all figures
+
+        return figures.of_scene(truth_of(self), self._readings("plot", q))
+
+    def _readings(self, what: str, q: npt.ArrayLike) -> FloatArray:
+        """Joint readings (n,) of a call. Raises InputError for others."""
+        types = self.joint_types or ""
+        readings = checked_array(f"{what}: q", q, (len(types),), f"({len(types)},), rad or m", finite=True)
+        require_radians(f"{what}: q", readings, types)
+        return readings
 
 
 def load_config(

@@ -111,6 +111,11 @@ def _chance(first: int, second: int) -> float:
 _STATISTICS = "statistics.json"
 
 
+def _drawn(data: Any, draw: Any) -> Any:
+    height, width = (4.0, style.WIDTH) if draw is draw_basin else (2.9, 0.65 * style.WIDTH)
+    return style.drawn(draw, data, height, width)
+
+
 def report(path: Path, formats: Sequence[str], progress: Progress) -> tuple[dict[str, Any], list[Path]]:
     """Write statistics and figures of the table of a sweep next to it; return both."""
     table, folder = SweepTable(path), path.parent
@@ -122,8 +127,7 @@ def report(path: Path, formats: Sequence[str], progress: Progress) -> tuple[dict
     figures = list(pictures(table))
     for done, (name, data, draw) in enumerate(figures):
         progress("figures", done, len(figures))
-        height, width = (4.0, style.WIDTH) if draw is draw_basin else (2.9, 0.65 * style.WIDTH)
-        made = style.contents(style.drawn(draw, data, height, width), formats)
+        made = style.contents(_drawn(data, draw), formats)
         files += [write_whole(folder / f"{name}.{kind}", content) for kind, content in made.items()]
         files.append(write_whole(folder / f"{name}.csv", to_csv(data)))
     progress("figures", len(figures), len(figures))
@@ -204,6 +208,23 @@ class Study(Displayable):
             asked.append(known.get(name, name))
         found = _paired(self._table, asked)
         return [one | {"laws": [self._names.get(law, law) for law in one["laws"]]} for one in found]
+
+    def plot(self, name: str | None = None) -> Any:
+        """Draw a figure of the sweep, as its report does.
+
+        Parameters
+        ----------
+        name : of the figure, as in ``study.plot("final_error")``; by default the first that its values allow.
+
+        Raises
+        ------
+        InputError
+            If its values allow no such figure.
+        """
+        known = {one: (data, draw) for one, data, draw in pictures(self._table)}
+        if not known or name not in (None, *known):
+            raise InputError(f"plot: figure {name}: this sweep allows {', '.join(known) or 'none'}")
+        return _drawn(*known[name or next(iter(known))])
 
     def to_frame(self) -> Any:
         """Return the table as a pandas table; an InputError without pandas."""

@@ -472,3 +472,61 @@ def test_no_public_name_is_hidden_by_a_module():
         importlib.import_module(f"projservo_cli.{module.name}")
     assert {name: getattr(ps, name) for name in names} == before
     assert set(dir(ps)) >= set(names)
+
+
+def test_parts_of_observations_join_to_the_whole():
+    rng = np.random.default_rng(3)
+    images = rng.uniform(0.0, 900.0, (9, 3, 5, 2))
+    images[2, 1, 3] = np.nan
+    known = {"view": ("a", "b", "c"), "image_size": ((900, 901), (902, 903), (904, 905))}
+    whole = ps.Observations.from_arrays(rng.uniform(-1, 1, (9, 4)), images, sigma=np.ones((9, 3, 5)), **known)
+    first, last = whole.select(pose=range(4)), whole.select(pose=range(4, 9))
+    joined = ps.Observations.concat([first, last])
+    for name in ("pose", "marker", "q", "images", "sigma"):
+        np.testing.assert_array_equal(getattr(joined, name), getattr(whole, name))
+    few = ps.Observations.concat([first.select(marker=[4, 1]), last])
+    np.testing.assert_array_equal(few.images[:4, :, [1, 4]], images[:4, :, [1, 4]])
+    assert np.isnan(few.images[:4, :, [0, 2, 3]]).all()
+    one = whole.select(view=["c", "a"], marker=2)
+    assert (one.view, one.image_size) == (("c", "a"), ((904, 905), (900, 901)))
+    np.testing.assert_array_equal(one.images, images[:, [2, 0]][:, :, [2]])
+    for call, said in (
+        (lambda: whole.select(view="left"), "select: view 'left': choose among ['a', 'b', 'c']"),
+        (lambda: ps.Observations.concat([whole, one]), "concat: the observations differ in images"),
+        (lambda: ps.Observations.concat([]), "concat: an empty list"),
+        (lambda: ps.Observations.concat([whole, dataclasses.replace(whole, noise_px=1.0)]), "in noise_px"),
+    ):
+        with pytest.raises(ps.InputError) as refused:
+            call()
+        assert said in str(refused.value)
+
+
+def test_a_scene_and_a_sweep_are_drawn_before_and_without_a_report():
+    config = ps.Config.load("ur5").replace(FEW)
+    q = np.array(config.task.start.values(config.joint_types))
+    pose = config.pose(q)
+    metric = ps.simulate(config, q=q[None], noise_px=0.0)
+    assert metric.images.shape[0] == 1
+    np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)
+    assert len(config.plot(q).axes) == 1
+    for call in (config.pose, config.plot):
+        with pytest.raises(ps.InputError, match="rad"):
+            call(q[:3])
+    study = ps.sweep(config, laws=["exact"], runs=2, grid={"noise.servo_px": [0.0, 0.5]})
+    assert study.plot().axes[0].get_xlabel() == "noise.servo_px"
+    with pytest.raises(ps.InputError, match="plot: figure basin: this sweep allows success_over"):
+        study.plot("basin")
+
+
+def resolved(setup):
+    return Resolved(setup)
+
+
+def test_an_experiment_takes_the_class_of_a_law_as_servo_does(tmp_path):
+    config = ps.Config.load("ur5").replace(FEW)
+    for place, law in ((None, resolved), (tmp_path / "run", Resolved)):
+        made = ps.Experiment(config, place).make("servo", laws=[law])
+        (name,) = made.traces
+        assert name.endswith(f":{law.__name__}")
+    with pytest.raises(ps.InputError, match="give the name of a law"):
+        ps.Experiment(config).make("servo", laws=[3])

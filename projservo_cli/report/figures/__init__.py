@@ -39,6 +39,15 @@ def of_calibration(
     return spec.drawn(spec.data(Fit(calibration, observation.at_rest, held_out=held_out)))
 
 
+def of_scene(truth: Any, q: Any) -> "Figure":
+    """Draw figure 3 at joints (n,) alone: arm, face and cameras."""
+    polyline, of_face, of_rig = scene.standing(truth.robot, truth, q)
+    face = (truth.M_face[cyclic_order(truth.M_face)] @ of_face.T)[:, :3]
+    pyramids = scene.transformed(scene.plant_pyramids(truth, face), of_rig)
+    data = {"robot": polyline, "face_start": face, "pyramids": pyramids, "view": np.array(truth.view)}
+    return REGISTER["fig03_scene"].drawn(data)
+
+
 def of_plan(plan: Plan, scene: Any) -> "Figure":
     """Draw figure 16: the motion in the images, its joints and its margins over time.
 
