@@ -411,9 +411,11 @@ def _validate(
         moved, *others = (one["view"] for one in beyond)
         remedy = f"if it moved, fit it again: projservo calibrate {target} --refit {moved} --data {data}"
         reason += " in some cameras alone" if others else " in one camera alone"
-    raise WorkFailed(
-        "; ".join(filter(None, (f"{data}: {reason}: {passed}", remedy, calibration.order_advice)))
-    )
+    left_open, n = calibration.order_advice, len(calibration.joint_types)
+    order = calibration.undecided_order
+    if order is not None and order.size == n * (n - 1):  # all reversed is the other mount
+        left_open += "; no pose shows whether the cameras are on the tool (--mount) either"
+    raise WorkFailed("; ".join(filter(None, (f"{data}: {reason}: {passed}", remedy, left_open))))
 
 
 def _position_errors(

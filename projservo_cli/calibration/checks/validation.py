@@ -318,9 +318,10 @@ def residual_statistics(calibration: Calibration, observation: Observation) -> d
     limits: list[float | None] = [None] * len(views)
     if found["count"] and np.isfinite(calibration.sqrt_cov_shared).all():
         of_pairs = prediction_variance(calibration, observation.q).sum(axis=-1)[:, :, order]
-        J = joint_derivative(calibration, observation.q)[:, :, order] * per_rad(calibration.prismatic)
-        # These readings have their own noise.
-        of_readings = (calibration.sigma_q or 0.0) ** 2 * (J**2).sum(axis=(-2, -1))
+        of_readings = np.zeros_like(of_pairs)
+        if sigma_q := calibration.sigma_q:  # these readings have their own noise
+            J = joint_derivative(calibration, observation.q)[:, :, order] * per_rad(calibration.prismatic)
+            of_readings = sigma_q**2 * (J**2).sum(axis=(-2, -1))
         of_images = _image_noise(calibration, observation)
         stated = float(np.sqrt(np.median(of_pairs[compared])))
         noise = float(np.hypot(of_images, np.sqrt(np.median(of_readings[compared]))))
