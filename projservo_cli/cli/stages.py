@@ -163,8 +163,7 @@ def _motions(config: Any, options: Mapping[str, Any]) -> Any:
 
     if options["motions"] is None:
         return None
-    types = config.robot.joint_types if config.robot is not None else None
-    return read_joint_list(options["motions"], types, options["joint_unit"])
+    return read_joint_list(options["motions"], config.joint_types, options["joint_unit"])
 
 
 @main.stage(

@@ -72,6 +72,16 @@ def test_a_recording_notes_its_worst_joint_and_shows_the_last_images(projservo, 
     assert 'http-equiv="refresh"' not in page
 
 
+def test_poses_of_a_robot_that_has_limits_alone_are_recorded_as_doctor_asks(projservo, recording):
+    (recording / "refit_poses.csv").write_text("q1,q2\n0.1,-0.1\n0.15,0.05\n", encoding="utf-8")
+    alone = ("--set", "calibration.frames_per_joint=0", "--set", "calibration.random_poses=0")
+    poses = ("--motions", "refit_poses.csv", "--output", "refit.csv", "--json")
+    answer = projservo("record", "-c", "arm.yaml", *alone, *poses)
+    assert answer.code == 0, answer.err
+    assert answer.json["recorded"] == 3  # the start, and both
+    assert read_table("refit.csv").q[1:] == pytest.approx(np.array([[0.1, -0.1], [0.15, 0.05]]), abs=2e-3)
+
+
 def robot_with(**methods):
     quiet = dict.fromkeys(("open", "read", "command", "stop", "close"), lambda *_: None)
     limits = JointLimits(*np.array([[-1.0], [1.0], [1.0], [1.0]]))
