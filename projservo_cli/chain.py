@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from projservo_cli import plugins
-from projservo_cli.config import Config, stored_yaml
+from projservo_cli.config import Config, load_config, stored_yaml
 from projservo_cli.config.inputs import (
     about_of,
     joints_of,
@@ -68,7 +68,11 @@ class Chain:
     def __post_init__(self, wanted: Sequence[str], force: bool) -> None:
         stages = [name for name in self.names if name != "record"]
         why = "" if self.recording is None else self.recording.why
+        given, self.config = self.config, _with_refits(self.config, self.run)
         self.steps = steps_for(self.config, self.run, stages, laws=wanted, force=force, recording=why)
+        if self.config is not given:
+            note = "the configuration names no calibration.refits, and those of the run stand"
+            self.steps = [replace(one, note=note) if one.stage == STAGES[0] else one for one in self.steps]
         if self.recording is not None:
             self.steps.insert(0, Step("record", "", "", {}, why))
         self.laws = tuple(step.name.removeprefix(SERVO) for step in self.steps if step.law)
@@ -506,6 +510,20 @@ class Chain:
         from projservo_cli.loop.jit_warmup import compiling_in_background
 
         return compiling_in_background(codes_of(step.law for step in self._outdated))
+
+
+def _with_refits(config: Config, run: Run) -> Config:
+    """The configuration with the refits of a run, which belong to its table, where it names none itself."""
+    stored = run.results.get("calibrate")
+    if stored is None or config.calibration.refits or not run.calibration.refit:
+        return config
+    before = load_config(run.path, text=stored.configuration)
+    table = None if config.data is None else Path(config.data.table)
+    known = stored.inputs.get("table_sha256")
+    if table is not None and table.is_file() and digest(table.read_bytes()) != known:
+        return config
+    values = before.model_dump(mode="json", include={"calibration": {"refits"}, "data": True})
+    return config.replace(values if config.data is None else {"calibration": values["calibration"]})
 
 
 def _drives(step: Step) -> bool:

@@ -1,7 +1,7 @@
 """The command line called in this process, with stages that only pretend to work."""
 
 import shutil
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -63,7 +63,10 @@ class Stages:
         if isinstance(inputs, RefitInputs):
             self._make(f"refit of {inputs.view}")
             assert before is not None
-            return before
+            observation, found, held_out = before
+            names = *found.refit, inputs.view
+            found = replace(found, refit=names, refit_numbers=np.ones((len(names), 3)))
+            return observation, found, held_out
         told = inputs.source
         if isinstance(told, Table):
             types, seed, source = told.joint_types, told.seed, "recorded"

@@ -3,6 +3,7 @@
 import sys
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from tqdm import tqdm
@@ -280,6 +281,23 @@ def test_a_refit_begins_at_the_stored_calibration_and_is_up_to_date_in_the_new_r
     assert projservo("calibrate", "-o", "newer").code == 0
     assert reported.made == ["refit of left", "refit of right"]
     assert load("out").path.read_bytes() == before
+
+
+def test_a_refit_is_part_of_its_run_whatever_the_configuration_file_says(projservo, stages):
+    recorded, table = ("-c", "tiny.yaml", "-o", "out"), Path("out/trials.csv")
+    assert projservo("record", "calibrate", *recorded, "-q").code == 0
+    asked = ("--refit", "left", "--data", "t.csv", "-o", "new", "-q")
+    assert projservo("calibrate", "out", *asked).code == 0
+    for named in (("--data", table), ()):  # a configuration that names its table, and one that does not
+        answer = projservo("calibrate", "servo", "-c", "tiny.yaml", *named, "-o", "new", "--json")
+        assert answer.code == 0, answer.err
+        assert answer.json["calibrate"]["refits"][0]["view"] == "left"
+        assert "up to date, though the configuration names no calibration.refits" in answer.err
+    assert stages.made[:2] == ["calibrate", "refit of left"]
+    assert stages.made.count("calibrate") == 1
+    table.write_text(table.read_text() + "\n")  # recorded since, with the camera where it is now
+    assert projservo("calibrate", "-c", "tiny.yaml", "--data", table, "-o", "new", "-q").code == 0
+    assert load("new").calibration.refit == ()
 
 
 @pytest.mark.parametrize(
