@@ -46,6 +46,7 @@ from projservo_cli.calibration.prediction import LENS, along_the_arm
 from projservo_cli.calibration.projective import Projective, closed_form_operators
 from projservo_cli.calibration.robust_fit import (
     CHECK_READINGS,
+    MAX_PREDICTED,
     REFUSE_RATIO,
     Expected,
     Misfit,
@@ -89,8 +90,6 @@ _STRAYS = 0.1
 _LENS_STRAYS = 0.01
 # Distance beyond the border of an image, px, within which a search for corners may place one.
 _BEYOND_PX = 1.0
-# Effect of deviations from the model, over the image size, above which a calibration is not usable.
-_MAX_PREDICTED = 0.01
 # Noise of a camera over that of the quietest one from which it is named.
 _NOISY = 2.0
 # Maximum number of lines of advice.
@@ -211,7 +210,7 @@ def calibrate(
         else:
             problem = LeastSquares.of(detections, detections.reference())
             search = Search(problem, epipolar, of_pair, rng, progress, joint_noise)
-            limit = _MAX_PREDICTED * float(frame.size.max()) if max_predicted_px is None else max_predicted_px
+            limit = MAX_PREDICTED * float(frame.size.max()) if max_predicted_px is None else max_predicted_px
             asked = lens, init, curves
             solution, expected, result = _maximum_likelihood(search, whole, frame, expect, asked, limit)
         seconds = time.perf_counter() - begin

@@ -40,7 +40,7 @@ from projservo_cli.calibration.prediction import (
     predict,
     prediction_variance,
 )
-from projservo_cli.calibration.robust_fit import REFUSE_RATIO, inverse_root
+from projservo_cli.calibration.robust_fit import MAX_PREDICTED, REFUSE_RATIO, inverse_root
 from projservo_cli.calibration.views import resected
 from projservo_cli.geometry.lens import TERMS, undistort
 from projservo_cli.image_size import ImageSize, image_sizes
@@ -85,8 +85,6 @@ _MOST_APART = 100
 _AT_ONCE = 20
 # Number of poses within the joint ranges at which the error of the camera is stated.
 _POSES = 60
-# Error within the joint ranges, over the image size, above which a calibration is not usable.
-_MAX_PREDICTED = 0.01
 
 
 class _ViewError(NamedTuple):
@@ -214,7 +212,11 @@ class _Camera:
 
 
 def refit(
-    calibration: Calibration, observation: Observation, view: str, image_size: ImageSize | None = None
+    calibration: Calibration,
+    observation: Observation,
+    view: str,
+    image_size: ImageSize | None = None,
+    max_predicted_px: float | None = None,
 ) -> Calibration:
     """Fit a camera, and its lens if the calibration has one, again by images at joint readings.
 
@@ -224,6 +226,7 @@ def refit(
     observation : images of its markers by the camera that moved, and perhaps by others that did not.
     view : name of the camera that moved.
     image_size : width and height, px; None takes the extent of the images.
+    max_predicted_px : error of predictions above which the calibration is not usable, as of ``calibrate``.
 
     Returns
     -------
@@ -234,17 +237,35 @@ def refit(
     InputError
         If the calibration has no such view or no covariance, or the observation has not that view.
     WorkFailed
-        If the images do not determine the camera, or do not confirm the joint readings: the number, its
-        limit, and what would.
+        If the camera has not moved, or the images do not determine it, or do not confirm the joint readings:
+        the number, its limit, and what would.
     """
     for names, of in ((calibration.view, "calibration"), (observation.view, "images")):
         if view not in names:
             raise InputError(
                 f"no camera {view!r}: the {of} have {', '.join(names)}".replace("on have", "on has")
             )
-    camera = _fitted(_Images.of(calibration, observation), calibration.view.index(view))
+    images = _Images.of(calibration, observation)
+    _require_moved(images, view)
+    camera = _fitted(images, calibration.view.index(view))
     ratio = _require_confirmed(camera)
-    return _record(calibration, observation, camera, ratio, image_size)
+    found, pixels = (
+        images.problem.detections,
+        images.problem.detections.pixels[camera.v, camera.used[camera.v]],
+    )
+    size = np.ptp(pixels, axis=0) if image_size is None else image_sizes(image_size, len(found.view))
+    limit = max_predicted_px or MAX_PREDICTED * float(size.max())
+    return _record(calibration, observation, camera, ratio, limit)
+
+
+def _require_moved(images: _Images, view: str) -> None:
+    """Refuse to fit a camera again whose images agree with the calibration; a WorkFailed."""
+    c = images.calibration
+    views = images.errors_of_views(parameters_from(c), errors_of(c))
+    of_view = views[c.view.index(view)]
+    if np.isfinite(of_view.off_px) and not of_view.disagrees:
+        seen = ", ".join(one.text for one in views if np.isfinite(one.off_px))
+        raise WorkFailed(f"the {view} camera has not moved, and its calibration is kept: {seen}")
 
 
 def since_moved(old: Observation, new: Observation, view: str) -> Observation:
@@ -415,7 +436,7 @@ def _require_confirmed(camera: _Camera) -> float:
 
 
 def _record(
-    c: Calibration, observation: Observation, camera: _Camera, ratio: float, image_size: ImageSize | None
+    c: Calibration, observation: Observation, camera: _Camera, ratio: float, limit_px: float
 ) -> Calibration:
     """Calibration with a camera as fitted, at so many times the expected noise."""
     images, v, which, rows = camera.images, camera.v, camera.images.which, rows_of_camera(c, camera.v)
@@ -450,12 +471,11 @@ def _record(
         changed["corner_squares"] = np.concatenate([old, squares])
         changed["corner_q"] = np.concatenate([c.corner_q, observation.at_rest.q])
     new = dataclasses.replace(c, **changed)
-    pixels = found.pixels[v, found.seen[v]]
+    pixels = found.pixels[v, camera.used[v]]
     low, high = pixels.min(axis=0), pixels.max(axis=0)
     wide = 0.5 * (high - low)
     error = [_error_px(one, v, low - wide, high + wide) for one in (new, c)]
-    size = high - low if image_size is None else image_sizes(image_size, len(c.view))[v]
-    return _judged(new, v, error, found.pose_of[camera.used[v]], _MAX_PREDICTED * float(size.max()))
+    return _judged(new, v, error, found.pose_of[camera.used[v]], limit_px)
 
 
 def _bias(c: Calibration, camera: _Camera) -> FloatArray:
@@ -491,7 +511,8 @@ def _judged(c: Calibration, v: int, error: list[float], pose_of: IntArray, limit
     text = f"the {name} camera, fitted again from {poses} poses, errs by {now:.3g} px within the joint ranges"
     usable, reason, advice = c.usable, c.reason, c.advice
     if now > limit:
-        usable, reason = False, f"{text} ({limit:.3g} px allowed): add poses that spread farther"
+        more = f"more than calibration.max_predicted_px = {limit:.3g}"
+        usable, reason = False, f"{text}, {more}: add poses that spread farther"
     elif now > _MORE * before:
         advice = (f"{text}, {before:.3g} px before it moved: add poses that spread farther", *advice)
     grown: dict[str, Any] = {}

@@ -30,6 +30,8 @@ WARN_RATIO = 1.15
 _WARN_ERRORS = 4.0
 # Fitted over expected noise above which the model does not describe the data.
 REFUSE_RATIO = 3.0
+# Error of predictions, over the image size, above which a calibration is not usable, where none is set.
+MAX_PREDICTED = 0.01
 # Probability with which χ² of a true model lies beyond either end of its band.
 _CHI2_TAIL = 1e-4
 # Relative standard error of stated noise, which is itself an estimate.

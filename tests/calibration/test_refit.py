@@ -56,6 +56,26 @@ def test_errors_of_all_cameras_are_those_of_the_covariance(case):
     assert (poses, now > 0.7 * was, now < 4.0 * was) == (20, True, True)
 
 
+def test_a_camera_that_has_not_moved_is_kept(case):
+    arm, _, before, rng = case
+    with pytest.raises(WorkFailed, match=r"the left camera has not moved, .*the left images are .*allowed\)"):
+        refit(before, arm.observe(around(arm, 6, rng), SIGMA, rng), "left")
+
+
+def test_a_limit_of_the_error_holds_for_a_refit_as_for_a_calibration(case):
+    arm, moved, before, rng = case
+    seen = moved.observe(around(arm, 16, rng, 0.7, 0.2), SIGMA, rng)
+    strict, strays = (
+        refit(before, seen, "left", None, 0.01),
+        dataclasses.replace(seen, images=seen.images.copy()),
+    )
+    assert (refit(before, seen, "left").usable, strict.usable) == (True, False)
+    assert "more than calibration.max_predicted_px = 0.01" in strict.reason
+    strays.images[0, 0, :2] = 1e6  # what does not fit makes no image larger
+    few = of_views(strays, [0]) if len(arm.cameras) == 1 else strays
+    assert refit(before, few, "left").refit_numbers[0, 1] < 2.0 * strict.refit_numbers[0, 1]
+
+
 def test_wrong_detections_change_little(case):
     arm, moved, before, rng = case
     seen = moved.observe(around(arm, 16, rng, 0.7, 0.2), SIGMA, rng)
