@@ -189,6 +189,8 @@ class Chain:
                     self._fail(step, trace.reason)
                 elif trace.verdict != "converged" and step.part:  # nor are the next steps made
                     self._fail(step, f"ended in {trace.verdict}: {trace.reason}")
+                elif self.session is not None and (lost := self.session.lost):
+                    self._fail(step, lost)
             if self.failed:
                 return
 
@@ -437,7 +439,11 @@ class Chain:
             self.session.hold(asked.wait_s)
             return Action("wait", f"{asked.wait_s:g} s", asked.wait_s)
         seconds = sum(self.session.act(name, value) for name, value in asked.act.items())
-        return Action("act", ", ".join(f"{name} {value:g}" for name, value in asked.act.items()), seconds)
+        said = [
+            f"{name} {value:g}{', which holds nothing' * self.session.empty(name)}"
+            for name, value in asked.act.items()
+        ]
+        return Action("act", ", ".join(said), seconds)
 
     def _opened(self, inputs: ServoInputs) -> FloatArray:
         """Open the robot of somebody's, unless it is, and return where it stands (n,), rad or m."""

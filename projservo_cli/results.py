@@ -257,7 +257,8 @@ class ImageModel(Displayable, Calibration):
         InputError
             If there is no such camera, or the calibration has no covariance.
         WorkFailed
-            If the camera has not moved, or the images do not determine it or do not confirm the joint readings.
+            If the camera has not moved, or the images do not determine it, or do not confirm the joint
+            readings.
         """
         require_observations("refitted", observations)
         found, old = refit(self, observations, view, observations.image_size), self.observation

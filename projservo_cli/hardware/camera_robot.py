@@ -29,8 +29,8 @@ _EDGES, _REACH = 300, 6
 class Arm(Protocol):
     """A robot class whose images are projservo's.
 
-    It may have ``now``, ``truth``, ``release``, ``hold`` and ``act`` as in ``Robot``, and what the checks
-    before the first motion show: ``health() -> dict[str, float | str]``, such as the voltage.
+    It may have ``now``, ``truth``, ``release``, ``hold``, ``act`` and ``holding`` as in ``Robot``, and what
+    the checks before the first motion show: ``health() -> dict[str, float | str]``, such as the voltage.
     """
 
     def open(self) -> None:
@@ -69,7 +69,7 @@ class CameraRobot:
         self, arm: Arm, rig: Cameras, finder: Finder, numbers: Sequence[int], *, whole: bool = True
     ) -> None:
         self.arm, self.finder, self._numbers = arm, finder, np.array(numbers, dtype=np.int64)
-        for name in ("now", "truth", "release", "hold", "health", "identity", "act"):
+        for name in ("now", "truth", "release", "hold", "health", "identity", "act", "holding"):
             if callable(method := getattr(arm, name, None)):
                 setattr(self, name, method)
         now: Callable[[], float] = getattr(arm, "now", time.monotonic)

@@ -237,6 +237,7 @@ class SO101:
         if ends is not None and not (0 <= min(ends) < max(ends) < TURN):
             raise InputError(f"plant.options.gripper_counts {ends!r}: give two counts from 0 to {TURN - 1}")
         self._gripper_counts = ends
+        self._grip: tuple[int, float] | None = None  # where it was sent last, counts and share
         self._port, self._ids = port, numbers
         self._others = () if gripper is None else (gripper,)
         known = limits is not None and bool(np.isfinite([limits.lower, limits.upper]).all())
@@ -344,7 +345,16 @@ class SO101:
         way = abs(count - self._read()[i].at) * COUNT
         self._sent.pop(i, None)
         self._servos.enable({i: count}, self._speeds())
+        self._grip = count, value
         return way / _GRIPPER + _GRIPS_S
+
+    def holding(self, name: str) -> bool | None:
+        """Whether something keeps the gripper from where it was sent; None where it was not closed fully."""
+        if name != "gripper" or not self._others or self._grip is None:
+            return None
+        (i,) = self._others
+        away = abs(self._read()[i].at - self._grip[0]) * COUNT
+        return True if away > _LEAP else False if self._grip[1] == 0.0 else None
 
     def release(self) -> None:
         """Let go of the arm; the gripper stays as it is."""

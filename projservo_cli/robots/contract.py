@@ -111,10 +111,12 @@ class Robot(Protocol):
     since it was last asked for, which ``stop.max_force_n`` limits; and, if it is a simulator, ``truth()``,
     the pose (4, 4) of the tool in its base frame, m, or its joints (n,), for results alone. A simulator's
     time passes in ``command`` alone, which moves it to ``due``. ``act(name, value)`` is an action, such as of
-    a gripper: it returns at once, perhaps with the time that it takes, s, for which the arm is held. And
-    ``frames``, the images (V, height, width) of its last reading in grey, uint8, or None: a run keeps some,
-    which the report shows. A class that takes an argument ``limits`` is given those of its joints,
-    ``JointLimits``; one with an argument ``numbers`` those of all markers, in the order of its pixels.
+    a gripper: it returns at once, perhaps with the time that it takes, s, for which the arm is held;
+    ``holding(name)`` tells whether that action holds something, True or False, or None where that is not
+    known. And ``frames``, the images (V, height, width) of its last reading in grey, uint8, or None: a run
+    keeps some, which the report shows. A class that takes an argument ``limits`` is given those of its
+    joints, ``JointLimits``; one with an argument ``numbers`` those of all markers, in the order of its
+    pixels.
     """
 
     def open(self) -> None:
@@ -284,6 +286,12 @@ class PluginRobot:
             return 0.0  # of a simulated robot, which has nothing to act with
         seconds = self._ask("act", lambda: method(name, value))
         return float(self._numbers("act() gave a time", 0.0 if seconds is None else seconds, (), finite=True))
+
+    def holding(self, name: str) -> bool | None:
+        """Whether what an action closed holds something; None where the robot cannot tell."""
+        method = getattr(self.robot, "holding", None)
+        held = self._ask("holding", lambda: method(name)) if callable(method) else None
+        return None if held is None else bool(held)
 
     def _optional(self, name: str, default: Any) -> Any:
         """Return the answer of a method that a class may have; the default without it."""

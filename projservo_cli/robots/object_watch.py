@@ -12,7 +12,7 @@ from projservo_cli.robots.contract import Reading
 
 # Frames of a view in a row that show an object elsewhere: as many as are seen before the first motion.
 _FRAMES = WINDOW
-_LOOKS = 20  # after which one view is enough: a camera that was moved has been named by then
+LOOKS = 20  # after which one view is enough: a camera that was moved has been named by then
 # Deviations of their mean beyond which it is elsewhere, and motion that counts as none, px: edges are drawn
 # as far aside by another light, or by what hides a part of a tag.
 _DEVIATIONS, _LEAST_PX = 4.0, 0.5
@@ -34,6 +34,12 @@ class ObjectWatch:
         self._planned, self.reason, self._looks = s, "", 0
         self._frames: list[deque[FloatArray]] = [deque(maxlen=_FRAMES) for _ in s]
 
+    @property
+    def seen(self) -> bool:
+        """Whether the last frame of a view shows the object."""
+        last = [frames[-1] for frames in self._frames if frames]
+        return any(np.isfinite(s[:, 0]).sum() >= _LEAST_MARKERS for s in last)
+
     def observe(self, reading: Reading) -> None:
         """Compare a reading with where the object was."""
         off = list[bool]()
@@ -53,7 +59,7 @@ class ObjectWatch:
             if off[-1]:
                 told = f"{px:.3g} px in the {reading.view[view]} image ({most:.2g} at most)"
         self._looks = self._looks + 1 if any(off) else 0
-        if off and (all(off) or self._looks >= _LOOKS):
+        if off and (all(off) or self._looks >= LOOKS):
             self.reason = self.reason or (
                 f"the object {self.name}, markers {self._marker[0]} to {self._marker[-1]}, has moved since "
                 f"the motion was planned, by {told}: let it lie still, and plan again"

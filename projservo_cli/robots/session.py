@@ -5,8 +5,9 @@ from contextlib import ExitStack
 from types import TracebackType
 from typing import Self
 
-from projservo_cli.records import FloatArray, InputError
+from projservo_cli.records import FloatArray, InputError, WorkFailed
 from projservo_cli.robots.contract import PluginRobot, at_rest_after
+from projservo_cli.robots.object_watch import LOOKS, ObjectWatch
 from projservo_cli.robots.pacing import Steered
 
 
@@ -14,13 +15,16 @@ class Session:
     """A connection that is stopped and closed on every way out of its block; what was acted stays.
 
     ``robot``: that was opened, None before. ``steered``: its set-points. ``acted``: values that actions of it
-    were sent last, by their names.
+    were sent last, by their names. ``at``: the watch over the object at whose goal the arm stands, None
+    elsewhere. ``held``: names of objects that the tool took with an action, by that of the action.
     """
 
     def __init__(self) -> None:
         self.robot: PluginRobot | None = None
         self.steered: Steered | None = None
         self.acted: dict[str, float] = {}
+        self.at: ObjectWatch | None = None
+        self.held: dict[str, str] = {}
         self._stack = ExitStack()
 
     def __enter__(self) -> Self:
@@ -51,11 +55,48 @@ class Session:
             )
 
     def act(self, name: str, value: float) -> float:
-        """Have the robot act, and hold the arm for as long as that takes, s, which is returned."""
+        """Have the robot act, and hold the arm for as long as that takes, s, which is returned.
+
+        The first action at the goal of an object takes it, the next of its name lets go of it. Raises
+        WorkFailed where an object is not there to be taken, or was not.
+        """
+        takes = None if name in self.held else self.at
+        if takes is not None:
+            self._require_there(takes)
         seconds = 0.0 if self.robot is None else self.robot.act(name, value)
         self.acted[name] = value
         self.hold(seconds)
+        self.held.pop(name, None)
+        if takes is not None:
+            self.held[name], self.at = takes.name, None
+        if self.lost:
+            raise WorkFailed(self.lost)
         return seconds
+
+    def _require_there(self, watch: ObjectWatch) -> None:
+        """Look whether the object that the arm is about to take lies where the motion was planned to."""
+        assert self.steered is not None
+        for _ in range(LOOKS):
+            watch.observe(self.steered.hold())
+            if watch.reason:
+                raise WorkFailed(f"nothing was taken: {watch.reason}")
+        if not watch.seen:
+            raise WorkFailed(
+                f"nothing was taken: no image shows the object {watch.name} where it is to be: look where it "
+                "lies, and what hides it, then run again"
+            )
+
+    def empty(self, name: str) -> bool:
+        """Whether what an action closed holds nothing, as far as the robot can tell."""
+        return self.robot is not None and self.robot.holding(name) is False
+
+    @property
+    def lost(self) -> str:
+        """Name the object that the tool should hold, by what was acted, and does not; empty for none."""
+        for name, taken in self.held.items():
+            if self.empty(name):
+                return f"the {name} holds nothing, and should hold the object {taken}: look where that lies"
+        return ""
 
     def hold(self, seconds: float) -> None:
         """Hold the set-point for so long, s."""

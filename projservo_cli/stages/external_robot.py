@@ -261,12 +261,12 @@ def connected_robot(
         readings = scenario.termination.max_steps + 1 + WINDOW
         monitor = ImageMonitor(calibration, noise, readings, visible, plant.image_size)
     watch = None
-    if session.acted:  # it may hold the object
-        plan = None
     if plan is not None and plan.s_object is not None and plan.object_marker is not None:
-        numbers = plan.object_marker.tolist()
+        name, numbers = plan.object_name or "", plan.object_marker.tolist()
         places = np.array([driven.further.index(number) for number in numbers])
-        watch = ObjectWatch(plan.object_name or "", numbers, places, plan.s_object)
+        if name not in session.held.values():  # else it moves with the tool
+            watch = ObjectWatch(name, numbers, places, plan.s_object)
+    session.at = watch if scenario.inputs.displaced is None else None
     return DrivenRobot(steered, plant, _known_of(scenario, contract, calibration, law), monitor, watch)
 
 

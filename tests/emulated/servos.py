@@ -53,7 +53,7 @@ class Servo:
     def __init__(self, number, arm, joint, zero, sign):
         self.number, self.arm, self.joint, self.zero, self.sign = number, arm, joint, zero, sign
         self.memory, self.overload, self._held = bytearray(86), False, float(zero)
-        self.between = None  # counts of the shaft at which a part stops the gripper
+        self._between = None
         for address, size, value in _FACTORY:
             self.put(address, size, value)
         self.memory[5] = number
@@ -72,6 +72,19 @@ class Servo:
         if self.joint is None:
             return self._gripper()
         return self.zero + self.sign * self.arm.q[self.joint] * TURN / (2 * math.pi)
+
+    @property
+    def between(self):
+        """Counts of the shaft at which a part stops the gripper; None without a part."""
+        return self._between
+
+    @between.setter
+    def between(self, counts):
+        if counts != self._between:  # it turns on from where it stands
+            self._held, goal = self._gripper(), self.moments[-1][1] if self.moments else None
+            if goal is not None:
+                self.moments.append((self.arm.clock.now(), goal))
+            self._between = counts
 
     def _gripper(self):
         """Counts of the shaft of a gripper, which turns towards its goal until a part stops it."""

@@ -364,6 +364,7 @@ def test_the_gripper_closes_on_a_part_and_pushes_on_whatever_ends(opened, rig):
     arm.act("gripper", 0.0)
     time.sleep(1.7)
     assert gripper.present == 1500
+    assert arm.holding("gripper") is True
     assert gripper.get(42) == 1200
     gripper.overload = True  # which is no fault of a grip
     drive(arm, np.zeros(5))
@@ -371,6 +372,9 @@ def test_the_gripper_closes_on_a_part_and_pushes_on_whatever_ends(opened, rig):
     arm.release()
     assert gripper.on
     assert gripper.get(42) == 1200
+    gripper.between = None  # the part was taken away
+    time.sleep(0.6)
+    assert arm.holding("gripper") is False
 
 
 def test_what_the_gripper_cannot_do_is_named(opened, rig):

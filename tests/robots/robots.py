@@ -98,6 +98,17 @@ class Seeing(Sound):
         return q, s
 
 
+class Taking(Seeing):
+    """Has a gripper, which holds nothing."""
+
+    def act(self, name, value):
+        CALLS.append(f"{name} {value:g}")
+        return 0.4
+
+    def holding(self, name):
+        return False
+
+
 class Faulty(Sound):
     """Goes wrong in a way of its own after so many looks."""
 

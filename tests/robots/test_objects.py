@@ -36,12 +36,12 @@ def call(taught, projservo, monkeypatch):
     """A command for the part where ``Seeing`` has it, by default as displaced in the configuration."""
     monkeypatch.setattr(Seeing, "shift", PART.moved)
 
-    def called(*arguments, **where):
+    def called(*arguments, plant=PLANT, **where):
         for name, value in where.items():
             monkeypatch.setattr(Seeing, name, value)
         monkeypatch.setattr(Seeing, "looks", 0)
         goal = f"task.goal={{taught: {taught / 'goal.yaml'}, on: part}}"
-        given = ("-c", CONFIG, "-o", taught / "run", *REGULATED, "--set", PLANT, "--set", goal)
+        given = ("-c", CONFIG, "-o", taught / "run", *REGULATED, "--set", plant, "--set", goal)
         return projservo(*arguments, *given)
 
     return called
@@ -80,6 +80,19 @@ def test_a_sequence_looks_at_its_object_over_the_connection_that_drives(call, ta
         away = (np.linalg.inv(there) @ pose)[:3, 3]
         assert np.linalg.norm(away) == pytest.approx(0.03, abs=2e-3)
         assert abs(away[2]) == pytest.approx(0.03, abs=2e-3)
+
+
+def test_a_part_that_is_pushed_while_the_gripper_opens_is_not_gripped_at(call):
+    """The first action takes nothing: the part is watched on. The study ``pick_and_place`` has all steps."""
+    steps = [{"act": {"gripper": 1.0}}, {"to": "goal"}, {"act": {"gripper": 0.0}}]
+    plant = PLANT.replace("Seeing", "Taking")
+    asked = ("--law", "exact", f"--set=task.steps={json.dumps(steps)}", "--json")
+    answer = call("servo", *asked, plant=plant, later=(130, nudged(20.0)))
+    assert answer.code == 1, answer.err
+    assert re.search(
+        "the object part, .* has moved since the motion was planned", " ".join(answer.err.split())
+    )
+    assert [sent for sent in CALLS if isinstance(sent, str)].count("gripper 0") == 0
 
 
 def test_a_goal_that_may_stand_still_is_taught_without_the_part(taught, tmp_path, projservo, monkeypatch):

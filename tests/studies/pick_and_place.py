@@ -1,6 +1,6 @@
 """Pick a part wherever it lies with an emulated SO-101, lift and place it; and kill the command in each step.
 
-    python -m tests.studies.pick_and_place [RUNS] [--fps 30] [--rate 0.25] [--killed]
+    python -m tests.studies.pick_and_place [RUNS] [--fps 30] [--rate 0.25] [--killed | --disturbed]
 
 Bench, recording and mechanics are those of ``so101_goals``; a part with two tags of 30 mm lies beside the
 tool where somebody teaches once how it is gripped: the middle of the face and the direction of its upright
@@ -9,7 +9,10 @@ be placed, and puts it elsewhere, up to 150 mm and 60 degrees away. One call of 
 gripper, approaches along the normal, grips, lifts, goes over the place and down to it, opens and retreats.
 The part is gripped where the gripper closes within 5 mm and 5 degrees of how it was taught, moves with the
 tool before the cameras, and is dropped where the gripper opens or loses torque. The truth is that of the
-emulator. With ``--killed`` run k is interrupted half a second after step k mod 9 began.
+emulator. With ``--killed`` run k is interrupted half a second after step k mod 9 began; with ``--disturbed``
+the part is pushed by 20 mm (k even) or taken away, out of the gripper as well, half a second after step
+k // 2 mod 7 began, the last in which the gripper may hold it. The run is right where the part is named, and
+where the gripper was not closed after the part had gone before.
 """
 
 import argparse
@@ -42,6 +45,7 @@ from tests.studies.so101_tutorial import START, benched, by_hand
 
 RUNS = 20
 OPENED, CLOSED, PART = 2600, 1200, 1500  # counts of the gripper, and that at which the part stops it
+STEPS, PUSHED, BEFORE_GRIP = 7, rigid(Rotation.identity(), [0.0, 0.02, 0.0]), 3
 REACH_M, REACH_DEG, IN_PLACE_MM, IN_PLACE_DEG = 0.005, 5.0, 2.0, 2.0
 SEED, FARTHEST_M, MOST_DEG, APART_PX = 8_400, 0.15, 60.0, 12.0
 GRIP = (16.0, 8.0, -22.0, 14.0, 0.0)  # joints where the grip is taught, deg
@@ -154,21 +158,28 @@ def written(bench):
     file.write_text(f"{text}\n{named}")
 
 
-def interrupted(patch, step):
-    """Send this process SIGINT half a second after a step, counted from 0, began."""
-    begun = []
+def interrupted(patch, step, act=None, wait_s=0.5):
+    """Call, by default SIGINT to this process, half a second after a step, counted from 0, began."""
+    begun, act = [], act or (lambda: os.kill(os.getpid(), signal.SIGINT))
 
     def counted(call):
         def wrapped(*given, **more):
             begun.append(None)
             if len(begun) == step + 1:
-                threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT)).start()
+                threading.Timer(wait_s, act).start()
             return call(*given, **more)
 
         return wrapped
 
     patch.setattr(servo, "run", counted(servo.run))
     patch.setattr(Session, "act", counted(Session.act))
+
+
+def lost(bench, part, k):
+    """Push the part, or take it away, whatever holds it."""
+    with bench.arm.lock:
+        T = AWAY if k % 2 else PUSHED @ bench.arm.displacement
+        part.held, bench.arm.displacement = None, T
 
 
 def pictures(bench, patch):
@@ -245,6 +256,7 @@ def main():
     parser.add_argument("--fps", type=float, default=30.0, help="frames a second of both cameras")
     parser.add_argument("--rate", type=float, default=0.25, help="of the emulated clock; slower is safer")
     parser.add_argument("--killed", action="store_true", help="interrupt each run in another step")
+    parser.add_argument("--disturbed", action="store_true", help="push or take the part in each step")
     parser.add_argument(
         "--pictures", type=Path, help="folder of a PNG a run: taught, elsewhere, gripped, placed"
     )
@@ -275,7 +287,7 @@ def taught(bench, words, q):
 
 
 def _driven(bench, truth, given):
-    arm, runs, errors, kept = bench.arm, given.runs, [], 0
+    arm, runs, errors, kept, right = bench.arm, given.runs, [], 0, 0
     arm.displacement = np.eye(4)
     if (q := taught(bench, [*TEACH, "grip.yaml"], GRIP)) is None:
         return
@@ -289,12 +301,24 @@ def _driven(bench, truth, given):
         with Part(bench, truth, grip) as part, pytest.MonkeyPatch.context() as patch:
             if given.killed:
                 interrupted(patch, k % 9)
+            step, closed = k // 2 % STEPS, len(bench.bus.writes)
+            if given.disturbed:
+                interrupted(patch, step, lambda part=part, k=k: lost(bench, part, k), 0.5 / arm.clock.rate)
             taken = pictures(bench, patch)
             code, line = said(["servo", "-c", "arm.yaml", "-o", "run"])
             arm.clock.sleep(1.0)
             part.look()
         if given.pictures and len(taken) == 3:
             draw(given.pictures / f"{k}.png", (at_grip, *taken))
+        if given.disturbed:
+            sent = [row[3][:2] for row in bench.bus.writes[closed:] if row[1:3] == (6, 42)]
+            named = code == 1 and ("object part" in line or "the part" in line)
+            right += (good := named and (step >= BEFORE_GRIP or CLOSED.to_bytes(2, "little") not in sent))
+            what = "taken" if k % 2 else "pushed"
+            print(
+                f"{k:3} {what} in step {step + 1}: {'right' if good else 'WRONG'}, exit {code}  {line[-400:]}"
+            )
+            continue
         mm, deg = part.off(truth.robot.pose(q))
         gripper = bench.bus.servos[6]
         holds = not part.dropped and gripper.on and arm.torque_on.all()
@@ -303,6 +327,9 @@ def _driven(bench, truth, given):
             errors.append((mm, deg))
         how = f"part {mm:.2f} mm, {deg:.2f}° off, {'' if holds else 'NOT '}kept"
         print(f"{k:3} exit {code}: {how}  {line[-300:]}", flush=True)
+    if given.disturbed:
+        print(f"{right} of {runs} named, and nothing gripped at")
+        return
     found = np.array(errors).reshape(-1, 2)
     placed = int(((found[:, 0] <= IN_PLACE_MM) & (found[:, 1] <= IN_PLACE_DEG)).sum())
     within = f"within {IN_PLACE_MM:g} mm and {IN_PLACE_DEG:g}°"
