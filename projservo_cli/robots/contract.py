@@ -89,13 +89,25 @@ class Bounds(NamedTuple):
         """Write a value of joint i, rad or m, in its unit."""
         return in_unit(value, self.units[i] if self.units else "rad or m", digits)
 
-    def within_limits(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Least and most (n,) that a set-point may be at a reading (n,): one beyond a limit may return."""
-        return np.minimum(self.limits.lower, q), np.maximum(self.limits.upper, q)
+    def allowed(
+        self, q: FloatArray, sent: FloatArray, seconds: float
+    ) -> dict[str, tuple[FloatArray, FloatArray]]:
+        """Least and most (n,) that a set-point may be, by what is wrong with others.
 
-    def not_far_ahead(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Least and most (n,) that a set-point may be without leading a reading (n,) too far."""
-        return q - self.lead, q + self.lead
+        q : reading (n,); sent : (n,) the set-point before; seconds : since that was due, s.
+        """
+        step, lead = self.limits.speed * seconds, self.lead
+        return {
+            "too far ahead of the reading": (q - lead, q + lead),
+            # Back towards the reading it may jump, which shortens the path of the robot, by what a robot
+            # may be behind: a reading that is farther away is wrong.
+            "too far from the last one": (
+                np.maximum(np.minimum(sent, q), sent - lead) - step,
+                np.minimum(np.maximum(sent, q), sent + lead) + step,
+            ),
+            # One beyond a limit may return.
+            "beyond its limits": (np.minimum(self.limits.lower, q), np.maximum(self.limits.upper, q)),
+        }
 
 
 class Robot(Protocol):
@@ -524,6 +536,10 @@ class PluginRobot:
                     "with its fractions, else no latency can be estimated"
                 )
 
+    def seconds_to(self, due: float) -> float:
+        """Return the time, s, from when the last command was due, at most a period ago, to another."""
+        return max(0.0, due - max(self._due, self._shown[0] - self.bounds.period))
+
     def _wrong(self, target: FloatArray, speed: FloatArray, due: float) -> str:
         """Return the reason why a command must not be sent; empty if it may."""
         bounds = self.bounds
@@ -536,22 +552,14 @@ class PluginRobot:
         # From the last set-point on, which after a pause was held: thinking took a period at most.
         if self._sent is not None and (leap := self._leap(self._earlier, self._last, self._sent)):
             return leap
-        step = bounds.limits.speed * max(0.0, due - max(self._due, self._shown[0] - bounds.period))
-        for i in np.flatnonzero(np.abs(q - sent) > 2.0 * bounds.lead + step).tolist():
+        seconds = self.seconds_to(due)
+        for i in np.flatnonzero(
+            np.abs(q - sent) > 2.0 * bounds.lead + bounds.limits.speed * seconds
+        ).tolist():
             at, there = (bounds.text(i, values[i]) for values in (q, sent))
             return f"joint {i + 1} reads {at} where its set-point is {there}: check its unit and its encoder"
-        allowed = {
-            "beyond its limits": bounds.within_limits(q),
-            "too far ahead of the reading": bounds.not_far_ahead(q),
-            # Back towards the reading it may jump, which shortens the path of the robot, by what a robot
-            # may be behind: a reading that is farther away is wrong.
-            "too far from the last one": (
-                np.maximum(np.minimum(sent, q), sent - bounds.lead) - step,
-                np.minimum(np.maximum(sent, q), sent + bounds.lead) + step,
-            ),
-        }
         slack = _ROUND_OFF * (1.0 + np.abs(target))
-        for what, (low, high) in allowed.items():
+        for what, (low, high) in bounds.allowed(q, sent, seconds).items():
             for i in np.flatnonzero((target < low - slack) | (target > high + slack)).tolist():
                 at, least, most = (bounds.text(i, values[i]) for values in (target, low, high))
                 return f"the set-point of joint {i + 1}, {at}, is {what}: allowed are {least} to {most}"

@@ -10,6 +10,8 @@ from projservo_cli.robots.latency import History
 
 # Share of the sag allowed for that a servo may still be behind where sag is separated from lag.
 _STILL = 0.2
+# Share by which a step may exceed its bound by rounding.
+_ROUND_OFF = 1e-12
 
 
 class SetPoint:
@@ -17,8 +19,8 @@ class SetPoint:
 
     bounds : of its commands, with the limits of its servos.
     q : (n,) first reading, rad or m: where it is sent at first.
-    ``target``: (n,) the set-point, rad or m. ``short``: (n,) joints whose last step was cut short because the
-    set-point was too far ahead of the reading.
+    ``target``: (n,) the set-point, rad or m. ``short``: (n,) joints whose last step was cut short, mostly
+    because the set-point was too far ahead of the reading.
     """
 
     def __init__(self, bounds: Bounds, q: FloatArray) -> None:
@@ -45,12 +47,19 @@ class SetPoint:
         share = -math.expm1(-seconds / self._bounds.max_servo_lag_s)
         self._sag += share * weight * (self.target - q - self._sag)
 
-    def step(self, dq: FloatArray, seconds: float) -> tuple[FloatArray, FloatArray]:
-        """Go on by a joint step (n,), rad or m, in so many seconds: the set-point (n,) and its speed (n,)."""
-        bounds, lag, before, q = self._bounds, self._bounds.max_servo_lag_s, self.target, self._q
-        target = np.clip(before + dq, *bounds.not_far_ahead(q))
+    def step(
+        self, dq: FloatArray, seconds: float, counted_s: float | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Go on by a joint step (n,), rad or m, in so many seconds: the set-point (n,) and its speed (n,).
+
+        counted_s : the seconds as the robot counts them, which bound the step.
+        """
+        bounds, lag, before = self._bounds, self._bounds.max_servo_lag_s, self.target
+        counted_s = (seconds if counted_s is None else counted_s) * (1.0 + _ROUND_OFF)
+        ahead, near, within = bounds.allowed(self._q, before, counted_s).values()
+        target = np.clip(np.clip(before + dq, *ahead), *near)
         self.short = target != before + dq
-        self.target = np.clip(target, *bounds.within_limits(q))
+        self.target = np.clip(target, *within)
         speed = np.clip((self.target - before) / seconds, -bounds.limits.speed, bounds.limits.speed)
         fades = math.exp(-seconds / lag)
         self._behind = fades * self._behind + (1.0 - fades) * lag * np.abs(speed)
@@ -101,7 +110,7 @@ class Steered:
         if now > due:  # thinking took too long, and no set-point must be due in the past
             due = now + period
             self.overruns += 1
-        self.robot.command(*self.set_point.step(step, period), due)
+        self.robot.command(*self.set_point.step(step, period, self.robot.seconds_to(due)), due)
         self._due = due
         if self.robot.wait_until(due):
             self.overruns += 1

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from projservo_cli.records import VIEWS, JointLimits, WorkFailed
-from projservo_cli.robots.contract import Bounds
+from projservo_cli.robots.contract import Bounds, PluginRobot, at_rest_after
 from projservo_cli.robots.latency import DelayPrior, Delays, History
-from projservo_cli.robots.pacing import SetPoint
+from projservo_cli.robots.pacing import SetPoint, Steered
 
 PERIOD = 0.04
 SAG = np.full(2, math.radians(1.0))
@@ -51,13 +51,49 @@ def test_a_set_point_leads_no_farther_than_it_may_and_stays_within_the_limits():
         point.step(np.array([0.08, 0.0]), PERIOD)  # and nothing moves
     np.testing.assert_array_equal(point.target, [0.4, 0.0])
     assert point.short.tolist() == [True, False]
-    point.read(np.array([1.4, 0.0]), PERIOD)
+    point.read(np.array([1.1, 0.0]), PERIOD)
     target, _ = point.step(np.array([0.05, 0.0]), PERIOD)
-    assert target[0] == pytest.approx(1.0)  # no farther behind than it may lead
+    assert target[0] == pytest.approx(0.7)  # no farther behind than it may lead
     point.read(np.array([1.45, 0.0]), PERIOD)
     for _ in range(20):
         point.step(np.array([0.08, 0.0]), PERIOD)
     assert point.target[0] == 1.5
+
+
+class Hasty:
+    """A robot whose clock a test sets, and which lags; joints (2,) as they are read."""
+
+    def __init__(self):
+        self.q, self.time = np.zeros(2), 0.0
+
+    def open(self): ...
+    def stop(self): ...
+    def close(self): ...
+
+    def now(self):
+        return self.time
+
+    def read(self):
+        return self.q, np.zeros((2, 1, 2))
+
+    def command(self, target, speed, due):
+        self.q = self.q + 0.6 * (target - self.q)
+        # A wait may end a little before it is due.
+        self.time = due - 0.09 * PERIOD * np.random.default_rng(int(1e4 * due)).random()
+
+
+def test_what_is_sent_is_what_the_contract_allows_however_the_clock_and_the_steps_are():
+    rng, cut = np.random.default_rng(2), 0
+    robot = PluginRobot(Hasty(), "hasty", 1, BOUNDS, 10.0, 10.0)
+    with at_rest_after(robot):
+        steered = Steered(robot)
+        for k in range(400):
+            steered.observe()
+            steered.command(rng.uniform(-0.2, 0.2, 2), PERIOD)  # up to 2.5 times the speed limit
+            cut += bool(steered.set_point.short.any())
+            if k % 3 == 0:
+                steered.resume()
+    assert cut > 100
 
 
 NOISE = 0.5
