@@ -47,8 +47,8 @@ class ServoSilent(WorkFailed):
     def __init__(self, silent: Sequence[int], garbled: Sequence[int] = ()) -> None:
         self.silent, self.garbled = tuple(silent), tuple(garbled)
         super().__init__(
-            f"replies of servos {', '.join(map(str, garbled))} are garbled: two servos answer at once: "
-            "unplug the other arm, or the servo that has the same id"
+            f"replies of servos {', '.join(map(str, garbled))} are garbled: a cable is loose, or two servos "
+            "answer at once: look at the cables, or unplug the other arm, or the servo that has the same id"
             if garbled
             else f"servos {', '.join(map(str, silent))} do not answer"
         )

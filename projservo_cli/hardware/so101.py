@@ -113,12 +113,13 @@ class Servos:
             if error.garbled and there:
                 raise InputError(
                     f"{where} answers of servo {error.garbled[0]} are garbled, those of {there} are not: "
-                    "two servos have this id: unplug one of them, and set its id"
+                    "two servos have this id, or its cable is loose: look at it, or unplug one and set its id"
                 ) from error
             if error.garbled:
                 raise InputError(
                     f"{where} servos answer, but every reply is garbled: two arms share this bus, such as "
-                    "leader and follower, or all servos have one id: unplug one arm, or set each id alone"
+                    "leader and follower, or all servos have one id, or a cable is loose: unplug one arm, "
+                    "set each id alone, or look at the cable"
                 ) from error
             if there:
                 raise InputError(
