@@ -1,7 +1,6 @@
 """The configuration as a whole; every key has its unit in its name."""
 
 import inspect
-import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Annotated, Any, Self, cast
@@ -12,7 +11,7 @@ from pydantic import AfterValidator, Field, StringConstraints
 from projservo_cli.display import Printed
 from projservo_cli.image_size import ImageSize
 from projservo_cli.laws import REGULATE
-from projservo_cli.records import LIMITS_MISSING, TOOL, WORLD, InputError
+from projservo_cli.records import LIMITS_MISSING, TOOL, WORLD, InputError, in_unit
 from projservo_cli.settings.cameras import Cameras
 from projservo_cli.settings.control import RENDERED, Control, PlantSettings, ReportSettings, Stop
 from projservo_cli.settings.disturbance import Disturbance
@@ -91,9 +90,9 @@ def _beyond_limits(robot: RobotSettings, vector: JointVector, *path: str) -> Ite
     for i, (value, joint) in enumerate(zip(values, robot.joints, strict=False)):
         low, high = joint.limits
         if not low <= value <= high and not any(joint.contradictions()):
-            turn, unit = (math.degrees, "deg") if joint.type == "R" else (float, "m")
-            what = f"{turn(value):.6g} {unit} is outside the limits of joint {i + 1}"
-            yield (*path, "joints", i), f"{what}, {turn(low):.6g} to {turn(high):.6g} {unit}"
+            unit = vector.unit if joint.type == "R" else "m"
+            at, least, most = (in_unit(x, unit) for x in (value, low, high))
+            yield (*path, "joints", i), f"{at} is outside the limits of joint {i + 1}, {least} to {most}"
 
 
 def _goal_images(
