@@ -45,7 +45,7 @@ from projservo_cli.results import ImageModel
 from projservo_cli.robots.client import DrivenRobot
 from projservo_cli.robots.session import Session
 from projservo_cli.robots.standstill import STILL
-from projservo_cli.simulation.analytic_plant import AnalyticPlant, Ends, Plant
+from projservo_cli.simulation.analytic_plant import AnalyticPlant, Ends, Plant, rig_distance
 from projservo_cli.simulation.faults import obstruction_of
 from projservo_cli.simulation.workspace import Truth
 from projservo_cli.stages import external_robot
@@ -582,8 +582,7 @@ def _reason(run: LawRun, joint: int, remaining: tuple[float | None, float | None
         f"{limits.stall_periods} steps: {_stalled_by(run)}",
         "following error": f"{run.why}; {rest}",
         "max steps": f"no step left; {judged} {error} was still changing",
-        "diverged": f"{judged} {error} (at first {first}) or the distance of the face grew "
-        f"{limits.diverged_factor:g}-fold",
+        "diverged": _grown(run, judged, error, first),
         "out of view": f"a face marker left an image at step {steps}",
         "behind camera": f"a face marker passed behind a camera at step {steps}",
         "markers lost": f"the law could not measure the face at step {steps}: {run.why or unseen}",
@@ -601,6 +600,17 @@ def _reason(run: LawRun, joint: int, remaining: tuple[float | None, float | None
         else _blind_view(log.s[: steps + 1], run.scenario.view, limits.stall_periods)
     )
     return "; ".join(filter(None, (reasons[run.verdict], blind, obstruction)))
+
+
+def _grown(run: LawRun, judged: str, error: str, first: str) -> str:
+    """Say which of error, distance and command made a run diverge."""
+    log, more = run.log, run.scenario.termination.diverged_factor
+    at, begun = rig_distance(run.plant, run.plant.M @ log.H[run.steps].T), float(log.begun[0])
+    if log.judged[run.steps] > more * log.begun[1]:
+        return f"{judged} {error} is more than {more:g} times that at first, {first}"
+    if at > more * begun > 0.0:
+        return f"the face is {at:.3g} m from the cameras, over {more:g} times the {begun:.3g} m at first"
+    return f"the command at step {run.steps} is not finite, at an {judged} of {error}"
 
 
 def _vague(run: LawRun) -> str:

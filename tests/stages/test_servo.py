@@ -1,6 +1,7 @@
 """Traces: what is recorded of a run against the truth, and every way it may be told to end."""
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -29,6 +30,14 @@ def test_trace_is_the_run_as_it_was():
     fastest = np.abs(trace.q_dot).max(axis=1)
     assert fastest.max() == pytest.approx(math.radians(125), rel=1e-12)
     assert fastest[trace.speed_factor < 1] == pytest.approx(math.radians(125), rel=1e-12)
+
+
+def test_a_run_that_diverges_by_distance_says_so():
+    config = configured("paper", "stop.diverged_factor=1.01", "control.mode=[regulate]")
+    calibration = calibrate.run(config)[1]
+    trace = servo.run(config, calibration, plan.run(config, calibration), "stacked")
+    assert trace.verdict == "diverged"
+    assert re.match("the face is 1.4. m from the cameras, over 1.01 times the 1.42 m at first", trace.reason)
 
 
 UNTESTED = "stop.innovation_threshold=0"
