@@ -70,6 +70,7 @@ def _teach(
     output = output or Path("start.yaml" if start else "goal.yaml")
     option.require_new(output, force=force)
     settings = option.configured(config, options, run, teaching=True)
+    option.say_unnamed(console)
     put = None
     if at is not None:
         try:
@@ -102,7 +103,10 @@ def _teach(
         write_whole(output, _TAUGHT + plain_yaml(taught.as_goal()))
     # Names are relative to the configuration, in the file and with --set.
     is_relative = config is not None and Path(config).resolve().parent == output.resolve().parent
-    setting = f"{'task.start' if start else 'task.goal'}: {output.name if is_relative else output.resolve()}"
+    goals = {} if start or settings.task is None else settings.task.goals
+    key = "start" if start else f"goals.{output.stem}" if goals else "goal"
+    setting = f"set task.{key}: {output.name if is_relative else output.resolve()}"
+    setting = f"goal {output.stem}: taught" if output.stem in goals else setting
     _print_taught(console, output, taught, check, setting)
     if start and taught.unseen:
         console.say(
@@ -150,7 +154,7 @@ def _print_taught(console: Console, path: Path, taught: Any, check: Any, setting
         far = ", ".join(f"{number} ({side}) by {px:.3g} px" for number, side, px in check.far)
         words.append(wrapped(check.reason, "  "))
         words.append(wrapped(f"markers that disagree with the calibration: {far or 'none'}", "  "))
-    console.report(value, [*words, f"set {setting}"])
+    console.report(value, [*words, setting])
 
 
 @main.command(

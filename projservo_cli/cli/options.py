@@ -40,6 +40,7 @@ class NumberRange(_Finite, click.FloatRange):
 
 NUMBER = _Finite()
 RESULTS = Path("results")
+_UNNAMED = "projservo: configuration"  # whether a call takes that which is shipped, as it names none
 _SIZE = re.compile(r"\s*(\d+)\s*[xX]\s*(\d+)\s*")
 _KEYS = {  # that options stand for
     "data": "data.table",
@@ -132,6 +133,7 @@ def configured(
 
     held = None if config or run is None else stored(run)
     if held is None or not held.configuration:
+        click.get_current_context().meta[_UNNAMED] = config is None
         return load_config(config or shipped("paper"), overrides(options), teaching=teaching)
     found = load_config(held.path, overrides(options), text=held.configuration)
     if not found.plant.simulated:
@@ -140,6 +142,12 @@ def configured(
             "configuration again with -c"
         )
     return found
+
+
+def say_unnamed(console: Console) -> None:
+    """Say, once, that a call names no configuration, where it takes that which is shipped."""
+    if click.get_current_context().meta.pop(_UNNAMED, False):
+        console.say("configuration: paper.yaml, which is shipped, since none is named (-c FILE)")
 
 
 def calibrated_run(run: Path | None, config: "Config") -> "Run | None":

@@ -536,6 +536,7 @@ def _work(console: Console, chain: "Chain", options: Mapping[str, Any]) -> int:
 
 def _announce(console: Console, chain: "Chain") -> None:
     """Print the stages to make by reason, and those up to date."""
+    option.say_unnamed(console)
     reasons: dict[str, list[str]] = {}
     for step in chain.steps:
         if step.stage == "record" and len(chain.recording.done) > chain.recording.found:

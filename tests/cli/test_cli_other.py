@@ -104,6 +104,12 @@ def test_a_goal_is_taught_and_told(projservo, tmp_path, monkeypatch):
     assert np.degrees(answer.json["joints"]) == pytest.approx([20, -5, 5, -10, 80])
     assert (answer.json["reached"], answer.json["far"], answer.json["unseen"]) == (None, None, [])
     text = (tmp_path / "goal.yaml").read_text()
+    named = ("--set", "task.goals={there: there.yaml}", "-o")
+    for file, said in (
+        ("there.yaml", "goal there: taught"),
+        ("x.yaml", f"set task.goals.x: {tmp_path}/x.yaml"),
+    ):
+        assert projservo(*hobby, *at, *named, file).out.splitlines()[-1] == said
     again = projservo(*hobby, *at)
     assert (again.code, "goal.yaml: exists already" in again.err) == (2, True)
     assert projservo(*hobby, *at, "--force", "-q").code == 0

@@ -179,7 +179,7 @@ def test_each_run_that_did_not_converge_or_missed_periods_has_a_line_with_its_re
     assert answer.code == 0
     first, second = answer.err.splitlines()[-2:]
     assert first.startswith(
-        "projservo: direct_three ended in converged: text ä; it missed 7 periods of 1.5 s:"
+        "projservo: direct_three converged: text ä; 7 of 3 periods took longer than 1.5 s:"
     )
     assert second == "projservo: stacked ended in diverged: text ä"
     assert projservo("servo", "-o", "out", "-q").err == ""
@@ -281,6 +281,13 @@ def test_a_refit_begins_at_the_stored_calibration_and_is_up_to_date_in_the_new_r
     assert projservo("calibrate", "-o", "newer").code == 0
     assert reported.made == ["refit of left", "refit of right"]
     assert load("out").path.read_bytes() == before
+
+
+def test_a_call_that_names_no_configuration_says_which_it_takes(projservo, stages):
+    said = "configuration: paper.yaml, which is shipped, since none is named (-c FILE)\n"
+    assert projservo("plan", "-o", "out").err.count(said) == 1
+    for named in (("-o", "out"), ("-c", "tiny.yaml", "-o", "own"), ("-o", "other", "-q")):
+        assert said not in projservo("plan", *named).err
 
 
 def test_a_refit_is_part_of_its_run_whatever_the_configuration_file_says(projservo, stages):
