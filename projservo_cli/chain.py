@@ -345,13 +345,12 @@ class Chain:
                 continue
             but = " must converge, but" if must and not converged else ""
             reason = " ".join(trace.reason.split())
-            text = (
-                f"{run_name(trace.law, trace.mode)}{but} ended in {trace.verdict}{reason and f': {reason}'}"
-            )
+            ended = "converged" if converged else f"{but} ended in {trace.verdict}".lstrip()
+            text = f"{run_name(trace.law, trace.mode)} {ended}{reason and f': {reason}'}"
             if trace.overruns:
                 text += (
-                    f"; it missed {trace.overruns} periods of {trace.period:g} s: raise control.period_s, or "
-                    "find fewer markers"
+                    f"; {trace.overruns} of {trace.steps} periods took longer than {trace.period:g} s: where "
+                    "many do, raise control.period_s, or find fewer markers"
                 )
             # Classical laws lead where nothing can be expected of them, images included.
             disturbed = trace.verdict == "fault detected" and trace.law not in POINT_LAWS
@@ -439,11 +438,9 @@ class Chain:
             self.session.hold(asked.wait_s)
             return Action("wait", f"{asked.wait_s:g} s", asked.wait_s)
         seconds = sum(self.session.act(name, value) for name, value in asked.act.items())
-        said = [
-            f"{name} {value:g}{', which holds nothing' * self.session.empty(name)}"
-            for name, value in asked.act.items()
-        ]
-        return Action("act", ", ".join(said), seconds)
+        said = ", ".join(f"{name} {value:g}" for name, value in asked.act.items())
+        nothing = any(map(self.session.empty, asked.act))
+        return Action("act", said + ", which holds nothing" * nothing, seconds)
 
     def _opened(self, inputs: ServoInputs) -> FloatArray:
         """Open the robot of somebody's, unless it is, and return where it stands (n,), rad or m."""
