@@ -249,11 +249,7 @@ def refit(
     _require_moved(images, view)
     camera = _fitted(images, calibration.view.index(view))
     ratio = _require_confirmed(camera)
-    found, pixels = (
-        images.problem.detections,
-        images.problem.detections.pixels[camera.v, camera.used[camera.v]],
-    )
-    size = np.ptp(pixels, axis=0) if image_size is None else image_sizes(image_size, len(found.view))
+    size = image_sizes(image_size, len(calibration.view))
     limit = max_predicted_px or MAX_PREDICTED * float(size.max())
     return _record(calibration, observation, camera, ratio, limit)
 
@@ -438,7 +434,7 @@ def _require_confirmed(camera: _Camera) -> float:
 def _record(
     c: Calibration, observation: Observation, camera: _Camera, ratio: float, limit_px: float
 ) -> Calibration:
-    """Calibration with a camera as fitted, at so many times the expected noise."""
+    """Calibration with a camera as fitted, at so many times the expected noise; no limit: of the extent."""
     images, v, which, rows = camera.images, camera.v, camera.images.which, rows_of_camera(c, camera.v)
     found, count, errors = images.problem.detections, len(rows), errors_of_others(images.calibration, v)
     common, own = images.changes(camera.params, errors)
@@ -475,6 +471,7 @@ def _record(
     low, high = pixels.min(axis=0), pixels.max(axis=0)
     wide = 0.5 * (high - low)
     error = [_error_px(one, v, low - wide, high + wide) for one in (new, c)]
+    limit_px = limit_px if np.isfinite(limit_px) else MAX_PREDICTED * float((high - low).max())
     return _judged(new, v, error, found.pose_of[camera.used[v]], limit_px)
 
 

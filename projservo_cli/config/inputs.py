@@ -102,7 +102,8 @@ def calibration_inputs(config: Config, files: Files | None = None) -> Calibratio
         seen, readings = (_file(config, f"{kind} {i}", files) for kind in _REFIT)
         assert seen is not None
         unit = one.joint_unit or (None if config.data is None else config.data.joint_unit)
-        inputs = RefitInputs(inputs, one.view, seen, readings, unit, config.image_size_px)
+        known = config.image_size_px, settings.max_predicted_px
+        inputs = RefitInputs(inputs, one.view, seen, readings, unit, *known)
     return inputs
 
 

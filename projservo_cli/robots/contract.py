@@ -124,11 +124,10 @@ class Robot(Protocol):
     the pose (4, 4) of the tool in its base frame, m, or its joints (n,), for results alone. A simulator's
     time passes in ``command`` alone, which moves it to ``due``. ``act(name, value)`` is an action, such as of
     a gripper: it returns at once, perhaps with the time that it takes, s, for which the arm is held;
-    ``holding(name)`` tells whether that action holds something, True or False, or None where that is not
-    known. And ``frames``, the images (V, height, width) of its last reading in grey, uint8, or None: a run
-    keeps some, which the report shows. A class that takes an argument ``limits`` is given those of its
-    joints, ``JointLimits``; one with an argument ``numbers`` those of all markers, in the order of its
-    pixels.
+    ``holding(name)`` tells whether it holds something, None where that is unknown. And ``frames``, the images
+    (V, height, width) of its last reading in grey, uint8, or None: a run keeps some, which the report shows.
+    A class that takes an argument ``limits`` is given those of its joints, ``JointLimits``; one with an
+    argument ``numbers`` those of all markers, in the order of its pixels.
     """
 
     def open(self) -> None:
@@ -301,14 +300,13 @@ class PluginRobot:
 
     def holding(self, name: str) -> bool | None:
         """Whether what an action closed holds something; None where the robot cannot tell."""
-        method = getattr(self.robot, "holding", None)
-        held = self._ask("holding", lambda: method(name)) if callable(method) else None
+        held = self._optional("holding", None, name)
         return None if held is None else bool(held)
 
-    def _optional(self, name: str, default: Any) -> Any:
+    def _optional(self, name: str, default: Any, *given: Any) -> Any:
         """Return the answer of a method that a class may have; the default without it."""
         method = getattr(self.robot, name, None)
-        return self._ask(name, method) if callable(method) else default
+        return self._ask(name, lambda: method(*given)) if callable(method) else default
 
     def require_identity(self, recorded: str) -> None:
         """Refuse a robot whose readings mean something else than when they were recorded; a WorkFailed."""
@@ -553,9 +551,8 @@ class PluginRobot:
         if self._sent is not None and (leap := self._leap(self._earlier, self._last, self._sent)):
             return leap
         seconds = self.seconds_to(due)
-        for i in np.flatnonzero(
-            np.abs(q - sent) > 2.0 * bounds.lead + bounds.limits.speed * seconds
-        ).tolist():
+        far = 2.0 * bounds.lead + bounds.limits.speed * seconds
+        for i in np.flatnonzero(np.abs(q - sent) > far).tolist():
             at, there = (bounds.text(i, values[i]) for values in (q, sent))
             return f"joint {i + 1} reads {at} where its set-point is {there}: check its unit and its encoder"
         slack = _ROUND_OFF * (1.0 + np.abs(target))

@@ -37,8 +37,7 @@ class ObjectWatch:
     @property
     def seen(self) -> bool:
         """Whether the last frame of a view shows the object."""
-        last = [frames[-1] for frames in self._frames if frames]
-        return any(np.isfinite(s[:, 0]).sum() >= _LEAST_MARKERS for s in last)
+        return any(f and np.isfinite(f[-1][:, 0]).sum() >= _LEAST_MARKERS for f in self._frames)
 
     def observe(self, reading: Reading) -> None:
         """Compare a reading with where the object was."""

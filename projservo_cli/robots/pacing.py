@@ -50,10 +50,7 @@ class SetPoint:
     def step(
         self, dq: FloatArray, seconds: float, counted_s: float | None = None
     ) -> tuple[FloatArray, FloatArray]:
-        """Go on by a joint step (n,), rad or m, in so many seconds: the set-point (n,) and its speed (n,).
-
-        counted_s : the seconds as the robot counts them, which bound the step.
-        """
+        """Go on by a joint step (n,), rad or m, in a time that the robot counts so: set-point, speed (n,)."""
         bounds, lag, before = self._bounds, self._bounds.max_servo_lag_s, self.target
         counted_s = (seconds if counted_s is None else counted_s) * (1.0 + _ROUND_OFF)
         ahead, near, within = bounds.allowed(self._q, before, counted_s).values()

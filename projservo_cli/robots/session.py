@@ -57,8 +57,7 @@ class Session:
     def act(self, name: str, value: float) -> float:
         """Have the robot act, and hold the arm for as long as that takes, s, which is returned.
 
-        The first action at the goal of an object takes it, the next of its name lets go of it. Raises
-        WorkFailed where an object is not there to be taken, or was not.
+        The first action at the goal of an object takes it, the next of its name lets go of it.
         """
         takes = None if name in self.held else self.at
         if takes is not None:

@@ -71,11 +71,7 @@ def _refitted(inputs: RefitInputs, before: _Calibrated) -> _Calibrated:
     kind, path = (calibration.joint_types, inputs.joint_unit), inputs.file.path
     readings = inputs.readings
     seen = read_table(path, *kind) if readings is None else read_detections(path, readings.path, *kind)
-    first = inputs.before
-    while isinstance(first, RefitInputs):
-        first = first.before
-    limit = first.estimation.max_predicted_px
-    found = refit(calibration, seen, inputs.view, inputs.image_size, limit)
+    found = refit(calibration, seen, inputs.view, inputs.image_size, inputs.max_predicted_px)
     return since_moved(old, seen, inputs.view), found, None
 
 

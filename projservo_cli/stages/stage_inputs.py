@@ -151,6 +151,7 @@ class RefitInputs:
     readings: File | None  # table of joints beside a list of detections
     joint_unit: str | None  # of revolute joints, deg or rad; None for rad
     image_size: ImageSize | None  # width and height, px, of all images or of one each, if known
+    max_predicted_px: float | None = None  # error of predictions that is accepted, px
 
 
 class SuggestionInputs(NamedTuple):
