@@ -534,15 +534,15 @@ def _farthest(detections: Detections) -> float:
 
 
 def _require_no_line(detections: Detections, sigma: float) -> None:
-    """Refuse a body whose markers lie on a line, up to the noise, in most images."""
+    """Refuse a body whose markers lie on a line, up to the noise, in most images; two of them always do."""
     off = []
     for seen, positions in zip(detections.seen, detections.pixels, strict=True):
         rows = np.flatnonzero(seen)
         rows = rows[np.argsort(detections.pose_of[rows], kind="stable")]
         for pixels in np.split(positions[rows], np.flatnonzero(np.diff(detections.pose_of[rows])) + 1):
-            if len(pixels) > 2:
-                across = np.linalg.svd(pixels - pixels.mean(axis=0), compute_uv=False)[1]
-                off.append(across**2 > sigma**2 * chdtri(len(pixels) - 2, _OFF_LINE_TAIL))
+            across = np.linalg.svd(pixels - pixels.mean(axis=0), compute_uv=False)[-1]
+            chance = chdtri(max(len(pixels) - 2, 1), _OFF_LINE_TAIL)
+            off.append(len(pixels) < 3 or across**2 > sigma**2 * chance)
     if off and np.mean(off) < 0.5:
         raise WorkFailed(ON_A_LINE)
 

@@ -251,3 +251,15 @@ def test_ratios_at_which_a_recorded_run_is_warned_of_and_refused(markers, frames
         assert calibration.chi2_per_dof == pytest.approx(ratio**2, rel=1e-6)
     if frames == 4:  # beyond the warning all is as with much data, which are slow
         assert "3.01 times" in refusal(observation, "RRR", sigma_px=found.sigma_fitted_px / 3.01)
+
+
+def test_two_markers_in_most_images_of_one_camera_are_too_few_and_no_line():
+    """Any two lie on one line: only images of three or more show that the body does."""
+    rng = np.random.default_rng(3)
+    robot = random_robot("RRR", rng, markers=6, views=1)
+    q = np.vstack([trials(robot, 6), around(robot, 8, rng)])
+    observation = robot.observe(q, SIGMA, rng)
+    for k, image in enumerate(observation.images):
+        image[:, 3 if k % 4 == 0 else 2 :] = np.nan
+        image[:, 2] = image[:, :2].mean(axis=1) if k % 4 == 0 else np.nan
+    assert "saw 4 markers at once in 0 poses" in refusal(observation, "RRR")
