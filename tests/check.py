@@ -45,7 +45,7 @@ Check = tuple[Sequence[str | Path], dict[str, str]]
 # Three at a time, in this order: the tutorial, whose emulator runs in real time, and the others behind it, in
 # the time that it leaves.
 TOGETHER: dict[str, Check] = {
-    "tutorial": ([*TUTORIAL, "not one_webcam"], {}),
+    "tutorial": ([*TUTORIAL, "not one_webcam and not refitted"], {}),
     "types": ([BIN / "mypy"], {}),
     "mathematics without the compiler": (
         [PYTHON, "-m", "pytest", "-q", "--benchmark-disable", *UNCOMPILED],
@@ -74,6 +74,7 @@ BY_NAME: dict[str, Check] = {
     ),
     "rendered": ([PYTHON, "-m", "tests.studies.rendered"], {}),
     "one webcam": ([*TUTORIAL, "one_webcam"], {}),
+    "refit": ([*TUTORIAL, "refitted"], {}),
     "part": ([PYTHON, "-m", "pytest", "-q", "tests/studies/pick_and_place.py"], {}),
 }
 

@@ -72,6 +72,7 @@ class Cameras:
         self.arm, self.clock, self.optics = arm, arm.clock, optics or Optics()
         self._random, self._stopping = np.random.default_rng(seed), threading.Event()
         self._ready, self._failure = threading.Event(), None
+        self.shift = np.zeros((2, 2), dtype=np.int64)  # of the images of each view, as of a camera that turned
 
     def __enter__(self):
         self._webcams = [_Webcam(self.clock) for _ in range(2)]
@@ -119,5 +120,5 @@ class Cameras:
         import cv2
 
         eyes.capture(view, self.arm.at(instant)[None], None, self._random)
-        image = eyes.last[view]
+        image = np.roll(eyes.last[view], self.shift[view][::-1], axis=(0, 1))
         return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, self.optics.quality])[1].tobytes()

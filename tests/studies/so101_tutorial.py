@@ -181,6 +181,42 @@ def test_one_webcam_is_enough_to_teach_record_and_calibrate(bench, capsys):
     assert "u_top,v_top,sigma_top" in (bench.folder / "trials.csv").read_text().splitlines()[0]
 
 
+def test_a_camera_that_moved_is_refitted_by_the_commands_of_doctor_and_stays_so(bench, capsys):
+    """What doctor prints is typed, then servo with the configuration that knows nothing of it."""
+    arm = bench.arm
+
+    def call(words, code=0):
+        given = run(words)
+        told = capsys.readouterr()
+        with capsys.disabled():
+            print(" ".join(words), told.out, told.err, sep="\n", flush=True)
+        assert given == code, f"{words}: {told}"
+        return told
+
+    for words, acts in (
+        (["init", "--arm", "so101", "arm.yaml"], []),
+        (["limits", "-c", "arm.yaml"], [None, by_hand(arm, *through_all())]),
+        (["teach", "--start", "-c", "arm.yaml"], [None, by_hand(arm, START), None]),
+        (["teach", "-c", "arm.yaml"], [None, by_hand(arm, GOAL), None]),
+        (["record", "calibrate", "-c", "arm.yaml", "-o", "results/arm"], []),
+    ):
+        bench.script[:] = acts
+        call(words)
+        if words[0] == "init":
+            configure(bench, SHORTER)
+    call(["calibrate", "results/arm", "--refit", "left", "--data", "trials.csv", "-o", "results/still"], 1)
+    assert not (bench.folder / "results/still/run.h5").exists()
+    bench.cameras.shift[0] = 12, -7
+    time.sleep(2.0)
+    mend = json.loads(call(["doctor", "-c", "arm.yaml", "--json", "results/arm"], 1).out)["refit"]
+    assert mend["view"] == "left"
+    for command in mend["commands"]:
+        call(command.split()[1:])
+    told = call(["servo", "-c", "arm.yaml", "-o", "results/arm_refit"])
+    assert "calibrate: making" not in told.err
+    assert "converged" in told.out
+
+
 def _homed_since(bench, capsys):
     """An arm that was homed after it was recorded is named before anything moves."""
     servo = bench.bus.servos[3]
