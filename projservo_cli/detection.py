@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import ndtr
 
+from projservo_cli.image_size import natural
 from projservo_cli.records import (
     CORNERS,
     BoolArray,
@@ -75,7 +76,7 @@ def _images(source: str) -> list[Path]:
     if not files:
         kinds = " ".join(sorted(suffix[1:] for suffix in _SUFFIXES))
         raise InputError(f"{source}: no images there; give a folder or a quoted pattern of files ({kinds})")
-    return sorted(files, key=_natural)
+    return sorted(files, key=lambda file: (natural(file.stem), file.name))
 
 
 def hidden_images(source: str) -> list[Path]:
@@ -101,11 +102,6 @@ def unfit(image: Any) -> str:
     if np.ptp(cells) > max(1.0, _MOSAIC * cells.mean()):
         return "is the mosaic of a colour sensor (Bayer): turn it into grey values or colours first"
     return ""
-
-
-def _natural(file: Path) -> tuple[list[tuple[int, str]], str]:
-    parts = re.findall(r"\d+|\D+", file.stem)
-    return [(int(part), "") if part.isdecimal() else (-1, part.lower()) for part in parts], file.name
 
 
 def _named(source: str, names: Sequence[str], where: str) -> list[Path]:

@@ -247,7 +247,7 @@ def plan_scene_of(config: Config, calibration: Calibration) -> PlanScene:
     return PlanScene(
         calibration.model(),
         joints.limits,
-        None if size is None else image_sizes(size, len(calibration.view)),
+        None if size is None else image_sizes(size, calibration.view),
         config.trajectory,
     )
 

@@ -5,22 +5,56 @@ same rule in ``geometry.kinematics.from_border``.
 """
 
 import math
+import re
+import unicodedata
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from projservo_cli.records import BoolArray, FloatArray
+from projservo_cli.records import VIEWS, BoolArray, FloatArray, InputError
 
 BEHIND = -1e9
 """Distance, px, from the border of an image of what no camera shows."""
-ImageSize = tuple[int, int] | tuple[tuple[int, int], ...]
-"""Width and height of the images, px: of all views, or of one each."""
+ImageSize = tuple[int, int] | tuple[tuple[int, int], ...] | Mapping[str, tuple[int, int]]
+"""Width and height of the images, px: of all views, or of one each, in order or by name."""
 
 
-def image_sizes(size: Any, views: int) -> FloatArray:
-    """Width and height (V, 2) of each image, px, by those of all views or of one each; infinite for None."""
+def image_sizes(size: Any, view: Sequence[str]) -> FloatArray:
+    """Width and height (V, 2) of each image, px, by those of all views or of one each; infinite for None.
+
+    Raises InputError for sizes of other views than those of the names.
+    """
+    if isinstance(size, Mapping):
+        if {*size} != {*view}:
+            raise InputError(
+                f"image sizes of {', '.join(size)}, but the views are {', '.join(view)}: give one size, or "
+                "one of each view"
+            )
+        size = [size[name] for name in view]
     sizes = np.array(math.inf if size is None else size, dtype=np.float64)
-    return np.broadcast_to(sizes, (views, 2)).copy()
+    if sizes.ndim == 2 and len(sizes) != len(view):
+        raise InputError(
+            f"{len(sizes)} image sizes for the views {', '.join(view)}: give one, or one a view in this order"
+        )
+    return np.broadcast_to(sizes, (len(view), 2)).copy()
+
+
+def view_named(camera: str) -> str:
+    """Name of the view of a camera, which may be a number, in small letters of one encoding."""
+    name = unicodedata.normalize("NFC", camera.strip().lower())
+    return f"cam{name}" if name.isdecimal() else name
+
+
+def views_in_order(names: Iterable[str]) -> list[str]:
+    """Names of views: left, right, then all others by their words and numbers, c2 before c10."""
+    return sorted(names, key=lambda name: (name not in VIEWS, natural(name)))
+
+
+def natural(name: str) -> list[tuple[int, str]]:
+    """Key that sorts names by their words and numbers, 2 before 10."""
+    parts = re.findall(r"\d+|\D+", name)
+    return [(int(part), "") if part.isdecimal() else (-1, part.lower()) for part in parts]
 
 
 def image_corners(sizes: FloatArray) -> FloatArray:

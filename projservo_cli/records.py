@@ -21,8 +21,9 @@ BoolArray = npt.NDArray[np.bool_]
 ByteArray = npt.NDArray[np.uint8]
 
 VIEWS = ("left", "right")
-# Name of a view, as in the columns u_NAME, v_NAME; q alone is that of joint readings: t_q is their time.
-VIEW_NAME = r"(?!q$)[a-z0-9][a-z0-9_]*"
+# Name of a view, as in the columns u_NAME, v_NAME, in small letters of any language, and of one word or more;
+# q alone is that of joint readings: t_q is their time.
+VIEW_NAME = r"(?!q$)[^\W_](?: ?\w)*"
 WORLD, TOOL = "world", "tool"  # where the cameras are mounted: the markers are on the other
 MM = 1e3  # mm in a metre
 TWO_TURNS = 4.0 * np.pi  # rad; no revolute joint of an arm with stops turns that far from its zero

@@ -6,6 +6,7 @@ once, so that each keeps its own loop: two-view geometry, rigid motions, axis po
 """
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
 from numbers import Real
 from typing import Any
@@ -401,7 +402,8 @@ def require_size_and_noise(image_size: Any, sigma_px: Any) -> None:
     if sigma_px is not None and not _is_positive(sigma_px):
         raise InputError(f"pixel noise {sigma_px!r}: give a positive number, or none to estimate it")
     if image_size is not None:
-        given = tuple(image_size) if np.iterable(image_size) else ()
+        each = image_size.values() if isinstance(image_size, Mapping) else image_size
+        given = tuple(each) if np.iterable(each) else ()
         for lengths in given if given and all(map(np.iterable, given)) else (given,):
             if len(lengths) != 2 or not all(map(_is_positive, lengths)):
                 raise InputError(

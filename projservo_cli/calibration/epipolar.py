@@ -372,7 +372,7 @@ class ImageFrame:
     def of(cls, detections: Detections, image_size: ImageSize | None) -> "ImageFrame":
         """Frame of widths and heights, px, else of the extent of the data in each view."""
         if image_size is not None:
-            sizes = image_sizes(image_size, len(detections.seen))
+            sizes = image_sizes(image_size, detections.view)
             return cls(0.5 * sizes, sizes.max(axis=1), True)
         # The outermost percent may be outliers.
         low, high = np.stack(

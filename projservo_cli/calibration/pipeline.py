@@ -225,12 +225,7 @@ def calibrate(
 
 def _require_inside(detections: Detections, image_size: ImageSize, strays: float) -> None:
     """Refuse an image size, width and height in px, with more than a share of a view's pixels outside."""
-    if np.ndim(image_size) == 2 and len(image_size) != len(detections.view):
-        raise InputError(
-            f"{len(image_size)} image sizes for the views {', '.join(detections.view)}: give one, or one a "
-            "view"
-        )
-    pixels, sizes = detections.pixels, image_sizes(image_size, len(detections.seen))
+    pixels, sizes = detections.pixels, image_sizes(image_size, detections.view)
     outside = detections.seen & (border_distance(pixels, sizes[:, None]) < -_BEYOND_PX)
     for view, name in enumerate(detections.view):
         seen = detections.seen[view]

@@ -249,7 +249,7 @@ def refit(
     _require_moved(images, view)
     camera = _fitted(images, calibration.view.index(view))
     ratio = _require_confirmed(camera)
-    size = image_sizes(image_size, len(calibration.view))
+    size = image_sizes(image_size, calibration.view)
     limit = max_predicted_px or MAX_PREDICTED * float(size.max())
     return _record(calibration, observation, camera, ratio, limit)
 

@@ -41,7 +41,7 @@ class NumberRange(_Finite, click.FloatRange):
 NUMBER = _Finite()
 RESULTS = Path("results")
 _UNNAMED = "projservo: configuration"  # whether a call takes that which is shipped, as it names none
-_SIZE = re.compile(r"\s*(\d+)\s*[xX]\s*(\d+)\s*")
+_SIZE = re.compile(r"(?:([^=]*)=)?\s*(\d+)\s*[xX]\s*(\d+)\s*")
 _KEYS = {  # that options stand for
     "data": "data.table",
     "readings": "data.readings",
@@ -176,14 +176,17 @@ def overrides(options: Mapping[str, Any]) -> list["Override"]:
             value = given.split(",")
         found.append(Override(flag, key, value))
     if (size := options.get("image_size")) is not None:  # such as 1280x1024,1280x960
-        flag, sizes = f"--image-size {size}", [_SIZE.fullmatch(one) for one in size.split(",")]
-        if None in sizes:
+        flag, parts = f"--image-size {size}", [_SIZE.fullmatch(one) for one in size.split(",")]
+        sizes = [(one[1], [int(one[2]), int(one[3])]) for one in parts if one is not None]
+        names = [name.strip() for name, _ in sizes if name is not None]
+        if len(sizes) < len(parts) or len({*names}) not in (0, len(parts)):
             raise click.UsageError(
                 f"{flag}: expected width x height in px, such as 1280x1024, or where views differ one each, "
-                "such as 1280x1024,1280x960"
+                "such as 1280x1024,1280x960 or left=1280x1024,right=1280x960"
             )
-        values = [[int(one[1]), int(one[2])] for one in sizes if one is not None]
-        found.append(Override(flag, "data.image_size_px", values if len(values) > 1 else values[0]))
+        values: Any = [one for _, one in sizes]
+        values = dict(zip(names, values, strict=True)) if names else values if len(values) > 1 else values[0]
+        found.append(Override(flag, "data.image_size_px", values))
     found += map(Override.parse, options["sets"])  # which would undo what follows
     if goals := options.get("goals"):
         found += to_goals(f"--goal {' --goal '.join(goals)}", goals)

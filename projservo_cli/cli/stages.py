@@ -60,8 +60,9 @@ _OF_STAGES = (
     ),
     click.option(
         "--image-size",
-        metavar="WxH[,WxH]",
-        help="Size of the images, px, or of the left and the right ones. Default: that of cameras or rig.",
+        metavar="[NAME=]WxH,...",
+        help="Size of the images, px, or one of each view: by name, or in order (left, right; of a list of "
+        "detections by name, c2 before c10). Default: that of cameras or rig.",
     ),
     option.force(help="Make the named stages even where they are up to date."),
     option.dry_run,

@@ -60,7 +60,7 @@ def region_around(
     span = share * (most - least)
     image = np.stack([np.nanmin(pixels, axis=(0, 2)), np.nanmax(pixels, axis=(0, 2))], axis=1)  # corners, px
     if size is not None:
-        image = image_corners(image_sizes(size, len(observation.view)))
+        image = image_corners(image_sizes(size, observation.view))
     within = np.maximum(least - span, np.minimum(low, least)), np.minimum(most + span, np.maximum(high, most))
     return Region(*within, image)
 

@@ -358,7 +358,7 @@ def write_animation(
     direct = [name for name in traces if name in BODY_LAWS]
     pair = [*direct[:1], *(name for name in traces if name in POINT_LAWS)]
     columns = {name: traces[name] for name in (pair if len(pair) > 1 else [*traces])[:_MOST_COLUMNS]}
-    sizes = image_sizes(size, len(next(iter(traces.values())).view))
+    sizes = image_sizes(size, next(iter(traces.values())).view)
     if size is None:
         seen = np.nanmax(np.concatenate([run.s.reshape(-1, 2) for run in traces.values()]), axis=0) + 1.0
         sizes = np.broadcast_to(seen, sizes.shape)

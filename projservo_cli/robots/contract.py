@@ -240,7 +240,7 @@ class PluginRobot:
             expected = f"({len(self._views)}, height, width)"
             raise WorkFailed(f"{self.name}: frames must be an array {expected} of uint8, or None")
         self.frames = None if frames is None else frames[self._rows]
-        sizes = image_sizes(self.image_size, len(self._views))
+        sizes = image_sizes(self.image_size, self._views)
         if frames is not None and np.isfinite(sizes).all() and (sizes != frames.shape[:0:-1]).any():
             shown = " x ".join(map(str, frames.shape[:0:-1]))
             asked = " and ".join(dict.fromkeys(f"{width:.0f} x {height:.0f}" for width, height in sizes))

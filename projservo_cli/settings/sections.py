@@ -10,6 +10,7 @@ from pydantic import (
     BaseModel,
     ConfigDict,
     Field,
+    PlainSerializer,
     Strict,
     ValidationInfo,
     WithJsonSchema,
@@ -18,6 +19,7 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
+from projservo_cli.image_size import view_named
 from projservo_cli.records import FARTHEST_M, VIEW_NAME, FloatArray
 
 Number = Annotated[float, Strict()]
@@ -41,12 +43,29 @@ def _one_or_each(value: Any, of_one: Callable[[Any], tuple[int, int]]) -> Any:
     return sizes[0] if len({*sizes}) == 1 else sizes
 
 
+def _of_each_name(value: Any, of_one: Callable[[Any], tuple[int, int]]) -> Any:
+    """Width and height of all images, those of each view in order, or by its name."""
+    if not isinstance(value, Mapping):
+        return _one_or_each(value, of_one)
+    sizes = {view_named(str(name)): of_one(size) for name, size in value.items()}
+    if len(sizes) < len(value):
+        raise ValueError(f"names a view twice among {', '.join(map(str, value))}")
+    return sizes
+
+
 _TWO = {"type": "array", "minItems": 2, "maxItems": 2}
 _SIZE = {"items": {"type": "integer", "minimum": 1, "maximum": 1_000_000}, **_TWO}
+_SIZES = {"items": _SIZE, "type": "array", "minItems": 1}
 Sizes = Annotated[
     tuple[Count, Count],
     WrapValidator(_one_or_each),
-    WithJsonSchema({"anyOf": [_SIZE, {"items": _SIZE, "type": "array", "minItems": 1}]}),
+    WithJsonSchema({"anyOf": [_SIZE, _SIZES]}),
+]
+SizesByName = Annotated[
+    tuple[Count, Count],
+    WrapValidator(_of_each_name),
+    PlainSerializer(lambda sizes: sizes),  # of whichever form
+    WithJsonSchema({"anyOf": [_SIZE, _SIZES, {"type": "object", "additionalProperties": _SIZE}]}),
 ]
 # The path from a section to a value in it, and the error of that value.
 Finding = tuple[tuple[str | int, ...], str]
@@ -76,7 +95,7 @@ class Section(BaseModel):
 
 def is_view(name: str) -> bool:
     """Whether a camera may have a name."""
-    return re.fullmatch(VIEW_NAME, name) is not None
+    return re.fullmatch(VIEW_NAME, name) is not None and name == view_named(name)
 
 
 class ByView(Section):

@@ -13,7 +13,7 @@ from projservo_cli.settings.sections import (
     Number,
     Positive,
     Section,
-    Sizes,
+    SizesByName,
     Whole,
 )
 
@@ -155,7 +155,8 @@ class Data(Section):
         "an external robot only if poses show it",
     )
     noise_px: Positive | None = Field(None, description="pixel noise per coordinate; null: estimated")
-    image_size_px: Sizes | None = Field(
+    image_size_px: SizesByName | None = Field(
         None,
-        description="width and height of all images, or those of each view; null: those of cameras or rig",
+        description="width and height of all images, or those of each view, in order or by name; null: those "
+        "of cameras or rig",
     )

@@ -109,7 +109,7 @@ def described_truth(
         number=numbers,
         face=tuple(numbers.index(number) for number in markers.front or ()) if face else (),
         center=center_in_face(markers),
-        image_size=image_sizes(rig.image_size_px, len(P)),
+        image_size=image_sizes(rig.image_size_px, tuple(rig.cameras)),
         lens=lens_of(P, *bent.T) if bent.any() else no_lenses(len(P)),
         normals=np.zeros(3) if markers.normals is None else markers.normals @ base_tool[:3, :3].T,
         view=tuple(rig.cameras),

@@ -162,7 +162,7 @@ def calibration_finding(
     if not calibration.usable or not calibration.has_covariance:
         return Finding(WARNING, _CALIBRATION, "is not usable", "record and calibrate again")
     known = image_size or [view.frame.grey.shape[::-1] for view in at_rest.views] or None
-    size = image_sizes(known, len(at_rest.s))
+    size = image_sizes(known, calibration.view)
     marker = np.array(at_rest.marker, dtype=np.int64)
     if not np.isfinite(at_rest.s[:, np.isin(marker, calibration.marker)]).any():
         return Finding(WARNING, _CALIBRATION, "was not compared: no marker of it is seen", "show the tags")
@@ -189,7 +189,7 @@ def with_refit(
     if len(moved) != 1 or len(views) < len(calibration.view):
         return finding, None
     size = image_size or [view.frame.grey.shape[::-1] for view in at_rest.views] or None
-    corners = image_corners(image_sizes(size, len(calibration.view)))
+    corners = image_corners(image_sizes(size, calibration.view))
     low = calibration.joint_min
     region, v = Region(low, low + calibration.excitation, corners), calibration.view.index(moved[0])
     try:

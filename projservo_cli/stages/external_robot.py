@@ -281,7 +281,7 @@ def _believed_plant(scenario: RunScenario, calibration: Calibration) -> Plant:
         center=task.center,
         O=task.O,
         visible=task.visible,
-        image_size=image_sizes(scenario.inputs.image_size, len(scenario.view)),
+        image_size=image_sizes(scenario.inputs.image_size, scenario.view),
         limits=scenario.joints.limits,
         opaque=False,
         least_views=scenario.least_views,

@@ -207,7 +207,7 @@ def _borders(inputs: PlanInputs, view: Sequence[str]) -> str:
     """Tell which borders images of an unknown size are taken to have; empty where the size is known."""
     if inputs.image_size is not None:
         return ""
-    sizes = ["x".join(f"{side:.0f}" for side in one) for one in image_sizes(inputs.seen_px, len(view))]
+    sizes = ["x".join(f"{side:.0f}" for side in one) for one in image_sizes(inputs.seen_px, view)]
     told = " and ".join(f"{size} {name}" for size, name in zip(sizes, view, strict=True))
     return (
         f"the size of the images is not known: they are taken to reach to the last pixels seen, {told}; "
@@ -236,7 +236,7 @@ def _require_taught_since(scenario: Scenario, calibration: Calibration) -> None:
     if images is None or (whole := scenario.goal_pixels) is None:
         return
     view, face = calibration.view, scenario.inputs.face
-    pixels, size = images.pixels(face, view), image_sizes(scenario.inputs.image_size, len(view))
+    pixels, size = images.pixels(face, view), image_sizes(scenario.inputs.image_size, view)
     numbers, seen = np.array([*pixels]), np.swapaxes(np.array([*pixels.values()]), 0, 1)
     if images.joints is not None:
         q = images.joints.values(calibration.joint_types)

@@ -181,7 +181,7 @@ class Scenario:
         face, units = asked.min_face_px, self.joints.units
         return Demands(
             limits=joints.limits,
-            image_size=image_sizes(size, len(self.view)),
+            image_size=image_sizes(size, self.view),
             border_px=border,
             conditioning=condition,
             keep=keep,

@@ -31,7 +31,7 @@ def opencv_yaml(found: OpenCV, size: ImageSize | None, names: Sequence[str], mou
     K, poses = found.body.intrinsics(), found.body.camera_poses()
     lines = ["%YAML:1.0", "---", f"delta_chi2: {found.delta_chi2!r}"]
     if size is not None:
-        sizes = image_sizes(size, len(names)).astype(int)
+        sizes = image_sizes(size, names).astype(int)
         alike = (sizes == sizes[0]).all()
         each = {"": sizes[0]} if alike else {f"{n}_": one for n, one in zip(names, sizes, strict=True)}
         for name, (width, height) in each.items():

@@ -13,6 +13,7 @@ import csv
 import io
 import math
 import re
+import unicodedata
 from array import array
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain, zip_longest
@@ -24,6 +25,7 @@ import numpy.typing as npt
 
 from projservo_cli.calibration.time_offset import require_seconds
 from projservo_cli.files import lines_of, write_whole
+from projservo_cli.image_size import view_named, views_in_order
 from projservo_cli.metric.position_error import Positions
 from projservo_cli.records import (
     FARTHEST_M,
@@ -135,9 +137,9 @@ def read_detections(
 ) -> Observation:
     """Read a list of detections of any cameras, ``pose, camera, marker, u, v``, beside a table of joints.
 
-    Optional columns: ``sigma``, px, and ``t``, s, the time of an image. Views are the cameras in the order of
-    their first rows; one whose name is a number n is cam n. Poses of the table of joints that no row names
-    are poses that no camera saw.
+    Optional columns: ``sigma``, px, and ``t``, s, the time of an image. Views are the cameras: left, right,
+    then all others by name, c2 before c10; one whose name is a number n is cam n. Poses of the table of
+    joints that no row names are poses that no camera saw.
     readings : table of joints, ``pose, q1 … qN``; joint_types, joint_unit : as for an observation table.
     Raises InputError ``file:line: message`` if a file cannot be read or a row is not valid.
     """
@@ -153,10 +155,9 @@ def read_detections(
             raise InputError(
                 f"{row.where}: pose {pose} has no joint readings in {readings}: add its row there"
             )
-        name = row["camera"].lower()
-        name = f"cam{name}" if name.isdigit() else name
+        name = view_named(row["camera"])
         if not _OF_VIEW.fullmatch(f"u_{name}"):
-            raise InputError(f"{row.where}: camera is {row['camera']!r}; expected a number or a word")
+            raise InputError(f"{row.where}: camera is {row['camera']!r}; expected a number or a name")
         where = poses[pose], views.setdefault(name, len(views)), row.integer("marker")
         if (line := lines.setdefault(where, row.line)) != row.line:
             raise InputError(
@@ -169,12 +170,14 @@ def read_detections(
             (row.number("u"), row.number("v"), sigma, row.number("t") if row.get("t") else math.nan)
         )
     sheet.require(rows, "a detection")
-    k, v, number = np.array(rows).T
+    k, first, number = np.array(rows).T
+    names = views_in_order(views)
+    v = np.array([names.index(name) for name in views])[first]
     markers, j = np.unique(number, return_inverse=True)
     if len(poses) * len(markers) > _MAX_CELLS:
         raise InputError(f"{sheet.file}: {len(poses)} poses × {len(markers)} markers are too many to hold")
     found = np.array(values)
-    images = np.full((len(poses), len(views), len(markers), 2), np.nan)
+    images = np.full((len(poses), len(names), len(markers), 2), np.nan)
     images[k, v, j] = found[:, :2]
     sigma_of, t_view = np.full(images.shape[:3], np.nan), np.full(images.shape[:2], np.nan)
     sigma_of[k, v, j], t_view[k, v] = found[:, 2], found[:, 3]
@@ -187,7 +190,7 @@ def read_detections(
         marker=markers,
         q=joints.q,
         images=images,
-        view=tuple(views),
+        view=tuple(names),
         t_view=t_view if np.isfinite(t_view).any() else None,
         sigma=None if some.all() else sigma_of,
     )
@@ -490,7 +493,7 @@ class _Sheet:
         if (header := self._next()) is None:
             expected = [*needed[:2], *["q1…qN"] * joints, *(_columns_of(VIEWS) if seen else needed[2:])]
             raise InputError(f"{self.file}: the table is empty; expected a header {','.join(expected)}")
-        names = [name.strip().lower() for name in header]
+        names = [unicodedata.normalize("NFC", name.strip().lower()) for name in header]
         self.joints = sorted(filter(_JOINT.fullmatch, set(names)), key=lambda name: int(name[1:]))
         self.views = _views_in(names) if seen else ()
         needed = [*needed, *_columns_of(self.views)]

@@ -43,6 +43,28 @@ def test_a_chain_of_another_rig(answer, elsewhere, types, views, mount):
         assert code in (0, 1), (kind, error)
 
 
+def test_case_45_sizes_reach_the_cameras_of_their_names(answer, case):
+    folder = case("45_order_of_views")
+    tables = "--data", folder / "s6_sizes_miss_tr.csv", "--readings", folder / "s6_sizes_miss_J.csv"
+    found = []
+    for sizes in ("1280x960,1920x1440,1600x1200", "c2=1600x1200, C0=1280x960,c1=1920x1440"):
+        code, value, error = answer("calibrate", *tables, "--image-size", sizes, "-o", f"out{len(found)}")
+        assert code == 0, error
+        assert value["view"] == ["c0", "c1", "c2"]
+        found.append(value["sigma_view_px"])
+    assert found[0] == found[1]
+    for names in ("c0=1280x960,c1=1920x1440", "c0=1280x960,c1=1920x1440,c3=1600x1200"):
+        code, _, error = answer("calibrate", *tables, "--image-size", names, "-o", "other")
+        assert (code, "but the views are c0, c1, c2: give one size, or one of each view" in error) == (
+            2,
+            True,
+        )
+    code, _, error = answer(
+        "calibrate", *tables, "--image-size", "640x480,1920x1440,1600x1200", "-o", "other"
+    )
+    assert (code, "of the c0 view are outside" in error) == (2, True)
+
+
 def test_three_webcams_before_a_real_arm(answer, elsewhere, shared_data):
     """A list of detections beside joints, of a quarter of the corners; bars are those of all corners."""
     rows = np.genfromtxt(shared_data / "ur3e" / "detections_cam123.csv", delimiter=",", names=True)

@@ -117,6 +117,18 @@ USAGE = {
         ["calibrate", "--data", "t.csv", "--image-size", "1280"],
         "--image-size 1280: expected width x height in px, such as 1280x1024",
     ),
+    "image sizes of some names": (
+        ["calibrate", "--data", "t.csv", "--image-size", "a=1x1,2x2"],
+        "--image-size a=1x1,2x2: expected width x height in px",
+    ),
+    "image sizes of one name": (
+        ["calibrate", "--data", "t.csv", "--image-size", "a=1x1,a=2x2"],
+        "--image-size a=1x1,a=2x2: expected width x height in px",
+    ),
+    "image sizes of one camera": (
+        ["calibrate", "--data", "t.csv", "--image-size", "a=1x1,A=2x2"],
+        "names a view twice among a, A",
+    ),
     "lens of show": (["show", "--lens"], "--lens: not used by show"),
     "record without table": (["record", "-c", "tiny.yaml"], "-o TABLE, or data.table"),
     "unit of no motions": (["record", "-o", "u.csv", "--joint-unit", "deg"], "--motions"),

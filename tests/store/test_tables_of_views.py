@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from projservo_cli.calibration.checks.validation import of_views
+from projservo_cli.image_size import image_sizes, views_in_order
 from projservo_cli.records import VIEWS, InputError
-from projservo_cli.store.observation_tables import read_detections, read_table
+from projservo_cli.store.observation_tables import read_detections, read_table, write_table
 from tests.calibration.simulated_robot import random_robot, trials
 
 
@@ -52,11 +53,40 @@ def test_a_list_of_detections_beside_joints_is_the_same_recording(seen, tmp_path
         np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), err_msg=name)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_views_of_a_list_are_by_name_whatever_the_order_of_its_rows(seen, tmp_path, seed):
+    names = ("right", "c10", "Kamera ü 2", "left")
+    head, *rows = listed(dataclasses.replace(seen, view=names))[0]
+    np.random.default_rng(seed).shuffle(rows)
+    (tmp_path / "d.csv").write_text("\n".join([head, *rows]) + "\n", encoding="utf-8")
+    (tmp_path / "q.csv").write_text("\n".join(listed(seen)[1]) + "\n")
+    found = read_detections(tmp_path / "d.csv", tmp_path / "q.csv", "RRR")
+    assert found.view == ("left", "right", "c10", "kamera ü 2")
+    np.testing.assert_array_equal(found.images, seen.images[:, [3, 0, 1, 2]])
+    write_table(found, tmp_path / "t.csv")
+    again = read_table(tmp_path / "t.csv", "RRR")
+    assert again.view == found.view
+    np.testing.assert_array_equal(again.images, found.images)
+
+
+def test_names_are_sorted_by_their_words_and_numbers():
+    names = ["c10", "right", "c2", "top", "C1", "left", "c02b"]
+    assert views_in_order(names) == ["left", "right", "C1", "c2", "c02b", "c10", "top"]
+
+
+def test_sizes_by_name_reach_the_views_of_these_names():
+    view, sizes = ("left", "c2", "c10"), {"c10": (3, 4), "left": (1, 2), "c2": (5, 6)}
+    np.testing.assert_array_equal(image_sizes(sizes, view), [[1, 2], [5, 6], [3, 4]])
+    for wrong in (sizes | {"top": (1, 1)}, {"left": (1, 2)}, [(1, 2), (3, 4)]):
+        with pytest.raises(InputError, match=r"the views (are )?left, c2, c10: give one"):
+            image_sizes(wrong, view)
+
+
 ERRORS = {
     "unknown pose": ("7,1,0,1,2", "d.csv:2: pose 7 has no joint readings in"),
     "twice": ("0,1,0,1,2\n0,1,0,1,2", "d.csv:3: marker 0 of camera cam1 at pose 0 is already in line 2"),
-    "no name": ("0,,0,1,2", "d.csv:2: camera is ''; expected a number or a word"),
-    "a blank in it": ("0,a b,0,1,2", "d.csv:2: camera is 'a b'"),
+    "no name": ("0,,0,1,2", "d.csv:2: camera is ''; expected a number or a name"),
+    "a blank in it": ("0,a  b,0,1,2", "d.csv:2: camera is 'a  b'"),
     "no pixel": ("0,1,0,,2", "d.csv:2: u is ''; expected a finite number"),
     "no rows": ("", "d.csv: the table has a header but no rows; add a detection a row"),
 }
