@@ -9,7 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from scipy.special import ndtr
@@ -146,8 +146,13 @@ _CROSS, _MIN_CROSS = 0.1, 1.5
 _MIN_SQUARE, _UNREFINED_SADDLE = 5.0, 0.3
 # Number of parameters of a corner, steps of their fit, and error of the model, px.
 _SADDLE, _SADDLE_STEPS, _SADDLE_FLOOR = 7, 12, 0.001
-# Rms residual, in contrasts, and distance from the guess, in squares, above which a corner is rejected.
-_MISFIT, _FAR_SADDLE = 0.25, 0.3
+# Error by the next corners, as a share of a square, and their distance, likewise, fitted to drawn boards.
+_LEAK_SADDLE = (0.3, 0.6)
+# Parts of a pixel across an edge of a saddle, and its minimum blur, px, of which the box of a pixel is none.
+_PARTS, _MIN_BLUR_SADDLE = 3, 0.05
+# Rms residual beyond noise, in contrasts, and distance from the guess, in squares, above which a corner is
+# rejected; standard errors that the noise may be estimated too low by chance.
+_MISFIT, _FAR_SADDLE, _CHANCE = 0.25, 0.3, 3.0
 # Minimum width of a cell, px, to fit edges of a tag, whose border is one cell wide.
 MIN_CELL = 1.8
 # Minimum length of a side to fit, px.
@@ -301,11 +306,14 @@ def _fitted(x: FloatArray, strips: _Strips, noise: FloatArray, steps: int) -> tu
         cost = (r * r).sum(axis=(1, 2)) + (stiff * x * x).sum(axis=1)
         return A, (J @ flat)[..., 0] + stiff * x, cost
 
-    return _minimized(x, equations, steps)
+    return _minimized(x, equations, steps, _MIN_BLUR)
 
 
 def _minimized(
-    x: FloatArray, equations: Callable[[FloatArray], tuple[FloatArray, FloatArray, FloatArray]], steps: int
+    x: FloatArray,
+    equations: Callable[[FloatArray], tuple[FloatArray, FloatArray, FloatArray]],
+    steps: int,
+    min_blur: float,
 ) -> tuple[FloatArray, FloatArray]:
     """Parameters (S, p) of least squares by Levenberg–Marquardt steps, the fifth a blur; normal matrices."""
     identity = np.eye(x.shape[1])
@@ -315,7 +323,7 @@ def _minimized(
         ridge = damping[:, None] * np.diagonal(A, axis1=1, axis2=2) + 1e-9
         step = np.linalg.solve(A + ridge[:, :, None] * identity, g[..., None])[..., 0]
         moved = x - step
-        moved[:, 4] = np.clip(np.abs(moved[:, 4]), _MIN_BLUR, _MAX_BLUR)
+        moved[:, 4] = np.clip(np.abs(moved[:, 4]), min_blur, _MAX_BLUR)
         new = equations(moved)
         better = new[2] <= cost
         x = np.where(better[:, None], moved, x)
@@ -668,19 +676,22 @@ class BoardFinder(Finder):
 
         image : (height, width) grey values from 0 to 255.
         """
-        guess, places = self._guess(image.astype(np.uint8)), self.board.places
-        known = np.isfinite(guess[:, 0])
-        H = None
-        if known.sum() >= _LEAST_CORNERS:
-            H = self.cv.findHomography(places[known], guess[known])[0]
-        if H is None:
+        guess = self._guess(image.astype(np.uint8))
+        if np.isfinite(guess[:, 0]).sum() < _LEAST_CORNERS:
             return {}, ()
+        _, steps = self._grid(self.board.places, guess)
+        return {0: _refine_saddles(image, guess, steps, _CROSS if self._detectors else np.inf)}, ()
+
+    def _grid(self, places: FloatArray, guess: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Corners (N, 2) of a plane grid, and steps (2, N, 2) to the next ones, px, by those seen."""
+        known = np.isfinite(guess[:, 0])
+        H = self.cv.findHomography(places[known], guess[known])[0]
+        if H is None:
+            H = np.full((3, 3), np.nan)
         here, *there = (
             self.cv.perspectiveTransform((places + step)[None], H)[0] for step in ((0, 0), (1, 0), (0, 1))
         )
-        return {
-            0: _refine_saddles(image, guess, np.stack(there) - here, _CROSS if self._detectors else np.inf)
-        }, ()
+        return here, np.stack(there) - here
 
     def like(self, tags: dict[int, Corners], before: dict[int, Corners] | None) -> dict[int, Corners]:
         """Return the board numbered from the end that moved least since the frame before."""
@@ -695,14 +706,62 @@ class BoardFinder(Finder):
         """Corners (N, 2) as of OpenCV, px, NaN where unseen."""
         guess = np.full((self.corners, 2), np.nan)
         if not self._detectors:
-            size, exhaustive = self.board.shape[::-1], self.cv.CALIB_CB_EXHAUSTIVE
-            found, corners = self.cv.findChessboardCornersSB(grey, size, flags=exhaustive)
-            return corners.reshape(-1, 2).astype(np.float64) if found else guess
+            return self._chessboard(grey)
         found = [detector.detectBoard(grey)[:2] for detector in self._detectors]
         corners, numbers = max(found, key=lambda one: 0 if one[1] is None else len(one[1]))
         if numbers is not None:
             guess[np.ravel(numbers)] = np.reshape(corners, (-1, 2))
         return guess
+
+    def _chessboard(self, grey: ByteArray) -> FloatArray:
+        """Corners (N, 2) of a chessboard by the first detector that finds it, px, NaN where covered.
+
+        As OpenCV numbers them, the square after the first corner is brighter than its neighbours.
+        """
+        rows, columns = self.board.shape
+        found, corners = self.cv.findChessboardCornersSB(
+            grey, (columns, rows), flags=self.cv.CALIB_CB_EXHAUSTIVE
+        )
+        if not found:  # obliquely seen boards are found by the older detector more often
+            found, corners = self.cv.findChessboardCorners(grey, (columns, rows))
+        seen = corners.reshape(rows, columns, 2).astype(np.float64) if found else self._part(grey)
+        for grid in (np.rot90(seen, k) for k in range(4)):
+            middles = 0.25 * (grid[1:, 1:] + grid[1:, :-1] + grid[:-1, 1:] + grid[:-1, :-1])
+            known = np.isfinite(middles[..., 0])
+            light = cast("FloatArray", grey[tuple(np.rint(middles[known]).astype(int).T[::-1])] - 128.0)
+            even = np.indices(known.shape).sum(axis=0)[known] % 2 == 0
+            if grid.shape[:2] == (rows, columns) and np.where(even, light, -light).sum() > 0.0:
+                return grid.reshape(-1, 2)
+        return np.full((rows * columns, 2), np.nan)
+
+    def _part(self, grey: ByteArray) -> FloatArray:
+        """Grid (r, c, 2) of the corners of a chessboard that is partly covered, px, NaN where covered.
+
+        It grows from the largest part without a gap. All four sides of the board must show, by two corners
+        each: else its numbers are not known, and the grid has another shape.
+        """
+        cv, least, most = self.cv, LEAST_ROWS, max(self.board.shape)
+        found, corners, part = cv.findChessboardCornersSBWithMeta(
+            grey, (least, least), cv.CALIB_CB_EXHAUSTIVE | cv.CALIB_CB_LARGER
+        )
+        if not found or max(part.shape) > most:
+            return np.empty((0, 0, 2))
+        places = np.indices((3 * most, 3 * most))[::-1].reshape(2, -1).T.astype(np.float64)
+        grid = np.full((3 * most, 3 * most, 2), np.nan)
+        grid[most : most + part.shape[0], most : most + part.shape[1]] = corners.reshape(*part.shape, 2)
+        image = grey.astype(np.float64)
+        for _ in range(most):
+            known = np.isfinite(grid[..., 0])
+            guess, steps = self._grid(places, grid.reshape(-1, 2))
+            next_to = (cv.dilate(known.astype(np.uint8), np.ones((3, 3))) > 0) & ~known
+            guess[~next_to.ravel()] = np.nan
+            fitted = _refine_saddles(image, guess, steps, np.inf)
+            new = fitted.clean.reshape(known.shape)
+            if not new.any():
+                break
+            grid[new] = fitted.pixels[fitted.clean]
+        r, c = (np.flatnonzero(known.sum(axis=axis) > 1) for axis in (1, 0))
+        return grid[r[0] : r[-1] + 1, c[0] : c[-1] + 1]
 
 
 def _refine_saddles(image: FloatArray, guess: FloatArray, steps: FloatArray, cross: float) -> Corners:
@@ -749,10 +808,18 @@ def _refine_saddles(image: FloatArray, guess: FloatArray, steps: FloatArray, cro
         r, J = _saddle_model(x, u, v, grey, weight)
         return J @ J.swapaxes(1, 2) + 1e-9 * np.eye(_SADDLE), (J @ r[..., None])[..., 0], (r * r).sum(axis=1)
 
-    x, A = _minimized(x, equations, _SADDLE_STEPS)
-    square = equations(x)[2] / np.maximum(count - _SADDLE, 1.0)
-    variance = np.linalg.inv(A)[:, [2, 3], [2, 3]].mean(axis=1) * square + _SADDLE_FLOOR**2
-    good = (count > _SADDLE) & (np.sqrt(square) < _MISFIT * np.abs(x[:, 1]))
+    x, A = _minimized(x, equations, _SADDLE_STEPS, _MIN_BLUR_SADDLE)
+    residual = _saddle_model(x, u, v, grey, weight)[0]
+    square = (residual**2).sum(axis=1) / np.maximum(count - _SADDLE, 1.0)
+    # Neighbours differ by noise alone: the rest of the residual is of something before the corner.
+    grid = len(at), 2 * half + 1, -1
+    r, both = residual.reshape(grid), weight.reshape(grid)
+    both = both[:, :, 1:] * both[:, :, :-1]
+    noise = 0.5 * (both * np.diff(r, axis=2) ** 2).sum(axis=(1, 2)) / np.maximum(both.sum(axis=(1, 2)), 1.0)
+    noise *= 1.0 + _CHANCE * np.sqrt(2.0 / count)
+    leak = _LEAK_SADDLE[0] * side[at] * ndtr(-_LEAK_SADDLE[1] * side[at] / x[:, 4])
+    variance = np.linalg.inv(A)[:, [2, 3], [2, 3]].mean(axis=1) * square + _SADDLE_FLOOR**2 + leak**2
+    good = (count > _SADDLE) & (square - noise < np.square(_MISFIT * x[:, 1])) & (square < x[:, 1] ** 2)
     good &= np.linalg.norm(x[:, 2:4], axis=1) < _FAR_SADDLE * side[at]
     found.pixels[at] += np.where(good[:, None], x[:, 2:4], np.nan)
     found.sigma[at], found.clean[at] = np.where(good, np.sqrt(variance), np.nan), good
@@ -767,12 +834,17 @@ def _saddle_model(
     du, dv, edges = u - u_0, v - v_0, []
     for angle in angles:
         c, s = np.cos(angle), np.sin(angle)
-        z = (c * dv - s * du) / sigma
-        bell = np.sqrt(2.0 / np.pi) * np.exp(-0.5 * z * z) / sigma
+        # A pixel is a box. Its extent across the edge counts in full, the other one by its variance.
+        wide, narrow = np.maximum(np.abs(c), np.abs(s)), np.minimum(np.abs(c), np.abs(s))
+        blur = np.sqrt(sigma**2 + (narrow**2 + (wide / _PARTS) ** 2) / 12.0)
+        shares = (np.arange(_PARTS) - 0.5 * (_PARTS - 1)) / _PARTS
+        z = (c * dv - s * du + wide * shares[:, None, None]) / blur
+        bell = np.sqrt(2.0 / np.pi) * np.exp(-0.5 * z * z) / blur
+        wider = (bell * z).mean(axis=0) * sigma / blur
+        bell = bell.mean(axis=0)
         # The edge, and its derivatives by u_0, v_0, σ and its angle.
-        edges.append(
-            (2.0 * ndtr(z) - 1.0, bell * np.stack(np.broadcast_arrays(s, -c, -z, -(s * dv + c * du))))
-        )
+        edge = (2.0 * ndtr(z) - 1.0).mean(axis=0)
+        edges.append((edge, np.stack([bell * s, -bell * c, -wider, -bell * (s * dv + c * du)])))
     (g, dg), (h, dh) = edges
     dg, dh = a * h * dg, a * g * dh
     J = np.stack([np.ones_like(g), g * h, *(dg[:3] + dh[:3]), dg[3], dh[3]], axis=1)

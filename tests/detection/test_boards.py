@@ -9,12 +9,14 @@ import pytest
 
 from projservo_cli.detection import Board, BoardFinder, finder_of
 from projservo_cli.settings.markers import BoardSettings, Markers
+from projservo_cli.store.observation_tables import read_table
 from tests.calibration.simulated_robot import Robot, around, random_robot
 from tests.detection.boards import drawn, view_of
 from tests.detection.test_detection import joints, write
 from tests.hardware.still import Quiet
 from tests.hardware.streams import Stream
 from tests.samples import revolute
+from tests.studies.detection_sigma import KINDS, SPECKLED, errors_of_boards
 
 cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed: pip install '.[detect]'")
 
@@ -36,8 +38,7 @@ def test_corners_err_as_they_say_and_have_their_numbers(rng, kind, side):
         corners = found[0]
         ends.add(end := int(np.linalg.norm(corners.pixels - true, axis=1).max() > side))
         true = true[::-1] if end else true
-        known = np.isfinite(corners.sigma)
-        assert corners.clean[known].all()
+        known = np.isfinite(corners.sigma) & corners.clean
         error.append((corners.pixels - true)[known])
         sigma.append(corners.sigma[known])
     assert len(error) > 4
@@ -58,6 +59,46 @@ def test_a_covered_corner_is_rejected_and_a_small_board_is_less_certain(rng):
     corners = BoardFinder(board, "4X4_250").find(image.astype(float))[0][0]
     assert not np.linalg.norm(corners.pixels[7] - true[7]) >= 4 * corners.sigma[7]  # which may be unknown
     assert np.isfinite(corners.sigma).sum() > 20
+
+
+@pytest.mark.parametrize("kind", [*KINDS, SPECKLED])
+def test_corners_err_as_they_say_in_images_of_all_kinds(kind):
+    found, lost = errors_of_boards("chessboard:9x6", kind, 4)
+    assert (lost, np.isfinite(found.sigma).mean() > 0.95) == (0, True)
+    assert 0.75 < np.sqrt(np.mean(found.error**2) / np.mean(found.sigma**2)) < 1.3
+
+
+@pytest.mark.parametrize(("place", "code"), [(22, 0), (0, 0), (range(0, 54, 9), 1)])
+def test_a_chessboard_is_found_partly_covered_where_all_its_sides_show(rng, place, code):
+    board = Board.of("chessboard:9x6")
+    image, _ = drawn(board, view_of(rng, 30.0), 0.7, 2.0, rng)
+    whole = BoardFinder(board, "").find(image.astype(float))[0][0]
+    for u, v in np.rint(whole.pixels[np.atleast_1d(place)]).astype(int):
+        image[v - 18 : v + 18, u - 18 : u + 18] = 120
+    found = BoardFinder(board, "").find(image.astype(float))[0]
+    assert bool(found) == (code == 0)
+    if found:
+        known = np.isfinite(found[0].sigma)
+        assert 45 <= known.sum() < 54
+        off = np.linalg.norm(found[0].pixels - whole.pixels, axis=1)[known]
+        assert (off < 5.0 * np.hypot(found[0].sigma, whole.sigma)[known]).all()
+
+
+def test_case_36_a_chessboard_under_speckle_is_found_less_certain(projservo, shared_data, tmp_path):
+    case = shared_data / "cases/36_speckle_chessboard"
+    answer = projservo(
+        *("detect", f"left={case / 'im'}", "--joints-csv", case / "q.csv", "--board", "chessboard:11x8"),
+        *("-o", tmp_path / "t.csv", "--json"),
+    )
+    assert (answer.code, answer.json["unseen"] < 13) == (0, True), answer.err  # of 264
+    table = read_table(tmp_path / "t.csv")
+    known = np.isfinite(table.sigma)
+    assert 0.05 < np.median(table.sigma[known]) < 0.2
+    for pixels, seen in zip(table.images[:, 0], known[:, 0], strict=True):
+        places = Board.of("chessboard:11x8").places[seen]
+        H = cv2.findHomography(places, pixels[seen])[0]
+        off = cv2.perspectiveTransform(places[None], H)[0] - pixels[seen]
+        assert 0.8 < np.sqrt(np.mean(off**2)) / np.sqrt(np.mean(table.sigma[known] ** 2)) < 1.3
 
 
 def test_images_of_a_symmetric_board_calibrate_a_robot(projservo, monkeypatch, tmp_path):
