@@ -10,13 +10,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from projservo_cli.calibration.bundle_adjustment import JointErrors, LeastSquares, fit_offsets, minimize
-from projservo_cli.calibration.detections import (
-    MAX_JUDGED,
-    RAYLEIGH,
-    even_choice,
-    medians,
-    per_rad,
-)
+from projservo_cli.calibration.detections import MAX_JUDGED, RAYLEIGH, even_choice, medians, per_rad
 from projservo_cli.calibration.epipolar import OUTLIER, ImageGeometry
 from projservo_cli.calibration.initialization import Nominal, Search, starting_markers, starts
 from projservo_cli.calibration.joint_noise import NO_JOINT_NOISE, JointNoise

@@ -338,7 +338,6 @@ REFUSED = [
     (lambda c, k, p: ps.Experiment(c).plan, r"holds no result of plan; make it first: make\('plan'\)"),
     (lambda c, k, p: ps.Experiment(c).make("report"), "give Experiment a path"),
     (lambda c, k, p: ps.Experiment(c).make("prepare"), "no such stage; stages: calibrate, plan, servo, rep"),
-    (lambda c, k, p: ps.Experiment(c).make("servo", laws=[Resolved]), "such as '.*test_api:Resolved'"),
     (lambda c, k, p: ps.sweep(c, laws=["exact"], workers=0), "workers=0: give a whole number of one or more"),
     (lambda c, k, p: ps.sweep(c, laws=["exact"], runs=0), "^sweep: runs: must be at least 1, not 0$"),
     (lambda c, k, p: ps.sweep(c, laws=[]), "sweep: name one law or more"),

@@ -72,7 +72,7 @@ class Cameras:
         self.arm, self.clock, self.optics = arm, arm.clock, optics or Optics()
         self._random, self._stopping = np.random.default_rng(seed), threading.Event()
         self._ready, self._failure = threading.Event(), None
-        self.shift = np.zeros((2, 2), dtype=np.int64)  # of the images of each view, as of a camera that turned
+        self.shift = np.zeros((2, 2), dtype=np.int64)  # px, of each view, as of one that turned
 
     def __enter__(self):
         self._webcams = [_Webcam(self.clock) for _ in range(2)]
