@@ -8,6 +8,7 @@ once, so that each keeps its own loop: two-view geometry, rigid motions, axis po
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import combinations
 from numbers import Real
 from typing import Any
 
@@ -312,6 +313,25 @@ def require_motion(detections: Detections) -> FloatArray:
             "which it does"
         )
     return span
+
+
+def require_no_copies(detections: Detections) -> None:
+    """Refuse two joints with the same readings at all poses, or two views with the same pixels."""
+    q, seen, view = detections.q, detections.seen, detections.view
+    for a, b in combinations(range(q.shape[1]), 2):
+        if (q[:, a] == q[:, b]).all():
+            first, second = sorted(int(detections.numbers[i]) for i in (a, b))
+            raise InputError(
+                f"the readings of joints {first} and {second} are the same at all {len(q)} poses: one column "
+                "is a copy of the other; put the joint's own readings there"
+            )
+    for a, b in combinations(range(len(view)), 2):
+        both = seen[a] & seen[b]
+        if both.any() and (detections.pixels[a, both] == detections.pixels[b, both]).all():
+            raise InputError(
+                f"the pixels of the views {view[a]} and {view[b]} are the same in all {both.sum()} rows that "
+                "have both: one is a copy of the other; put the camera's own pixels there, or leave it out"
+            )
 
 
 def describe_joints(

@@ -36,6 +36,7 @@ from projservo_cli.calibration.detections import (
     Detections,
     require_images,
     require_motion,
+    require_no_copies,
     require_size_and_noise,
 )
 from projservo_cli.calibration.epipolar import Epipolar, ImageFrame, ImageGeometry
@@ -189,6 +190,7 @@ def calibrate(
     with threadpool_limits(limits=1):
         whole = Detections.of(observation, joint_types, mount)
         require_motion(whole)
+        require_no_copies(whole)
         require_poses(whole)
         if image_size is not None:
             _require_inside(whole, image_size, _LENS_STRAYS if lens else _STRAYS)

@@ -407,6 +407,10 @@ def load_config(
         raise InputError(f"{document.place(())}: expected keys and values such as name: paper")
     if path is not None and not document.values and not document.problems:
         document.wrong((), "the configuration is empty; start from one of the shipped ones")
+    if "base" in document.values:
+        raise InputError(
+            f"{path}: configures a sweep and no run: projservo sweep -c {path}, or name its base"
+        )
     _spell_out(document.values)
     for change in changes:
         document.override(change)

@@ -181,13 +181,13 @@ def save(run: Run) -> Run:
 def stored(target: Path | str) -> Run:
     """Read a run file as ``load`` does; an empty run where there is none yet."""
     path = run_path(target)
-    return load(path) if path.exists() else Run(path)
+    return load(path) if path.exists() or (path.parent / SWEEP).is_file() else Run(path)
 
 
 def load(target: Path | str) -> Run:
     """Read a run file. Raises InputError if it is missing, changed, or of another version."""
     path = run_path(target)
-    if not path.is_file():
+    if not path.is_file() or path.name == SWEEP:
         if (path.parent / SWEEP).is_file():
             raise InputError(
                 f"{path.parent}: holds a sweep and no run; see projservo report {path.parent}, or repeat a "

@@ -8,7 +8,7 @@ import pytest
 from scipy.stats import chi2
 
 from projservo_cli.calibration import calibrate
-from projservo_cli.records import Observation, WorkFailed
+from projservo_cli.records import InputError, Observation, WorkFailed
 from tests.calibration.simulated_robot import NAMES, around, random_robot, trials
 from tests.studies.combined_mistakes import ENDS, ending
 
@@ -59,7 +59,7 @@ LITTLE = {
     "only one pose": some(poses=slice(1)),
     "the right camera saw no marker": changed(seen(), images=BLIND),
     "no marker was seen": changed(seen(), images=np.full_like(IMAGES, np.nan)),
-    "without a baseline": changed(seen(), images=IMAGES[:, [0, 0]]),
+    "without a baseline": changed(seen(), images=IMAGES[:, [0, 0]] + np.reshape([0.0, 1.0], (1, 2, 1, 1))),
 }
 
 
@@ -220,6 +220,19 @@ def test_a_prismatic_joint_whose_fit_as_revolute_would_pass_is_named(kinds, leng
     message = refusal(observation, "R" * len(kinds), joint_noise=None)
     assert re.search(rf"joint {kinds.index('P') + 1} is prismatic, .*{kinds} would fit", message)
     assert calibrate(observation, kinds, source="recorded", joint_noise=None).usable
+
+
+@pytest.mark.parametrize("copied", ["joints", "views"])
+def test_a_column_that_is_a_copy_of_another_is_named(copied):
+    observation = seen()
+    if copied == "joints":
+        observation.q[:, 4] = observation.q[:, 1]
+        message = "joints 2 and 5 are the same at all"
+    else:
+        observation.images[:, 1] = observation.images[:, 0]
+        message = "views left and right are the same in all"
+    with pytest.raises(InputError, match=message):
+        calibrate(observation, TYPES)
 
 
 @pytest.mark.parametrize("tail", [1e-4, 1.0 - 1e-4])

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from projservo_cli import cli
 from projservo_cli.cli import main
 
 PIECES = [("servo",), ("plan",), ("-c", "tiny.yaml", "-o", "out"), ("--json",)]
@@ -162,3 +163,38 @@ def test_what_makes_no_sense_is_refused_in_one_line_before_any_work(projservo, s
     assert answer.err.startswith("projservo: ")
     assert answer.err.count("\n") == 1
     assert (stages.made, set(tmp_path.iterdir())) == ([], there)
+
+
+EMPTY = {
+    "table": (["--data", "none.csv"], "none.csv: the table is empty"),
+    "rows": (["--data", "head.csv"], "head.csv: the table has a header but no rows"),
+    "joints": (["--data", "one.csv", "--readings", "none.csv"], "none.csv: the table is empty"),
+    "rows of joints": (["--data", "one.csv", "--readings", "q.csv"], "q.csv: the table has a header but no"),
+    "configuration": (["-c", "none.csv"], "none.csv: the configuration is empty"),
+    "sweep for a configuration": (["-c", "sweep.yaml"], "sweep.yaml: configures a sweep and no run"),
+    "sweep for a run": (["--data", "head.csv", "-o", "swept"], "swept: holds a sweep and no run"),
+    "its table": (["--data", "head.csv", "-o", "swept/sweep.h5"], "swept: holds a sweep and no run"),
+}
+
+
+@pytest.mark.parametrize("name", EMPTY)
+def test_a_file_that_is_empty_or_of_a_sweep_is_named_in_a_line(name, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "swept").mkdir()
+    for file, text in {
+        "none.csv": "",
+        "head.csv": "pose,marker,q1,u_left,v_left,u_right,v_right\n",
+        "q.csv": "pose,q1\n",
+        "one.csv": "pose,camera,marker,u,v\n0,c0,0,1,1\n",
+        "sweep.yaml": "base: paper.yaml\nruns: 2\n",
+        "swept/sweep.h5": "",
+    }.items():
+        (tmp_path / file).write_text(text)
+    given, message = EMPTY[name]
+    output = [] if "-o" in given else ["-o", "out"]
+    assert cli.run(["calibrate", *given, *output]) == 2
+    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("projservo: ")]
+    assert len(lines) == 1
+    assert message in lines[0]
+    assert not (tmp_path / "out").exists()
+    assert sorted(file.name for file in (tmp_path / "swept").iterdir()) == ["sweep.h5"]
