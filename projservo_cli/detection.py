@@ -9,7 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import ndtr
@@ -525,6 +525,14 @@ class Finder(ABC):
         """Return tags numbered as in the frame before, where a board looks the same from several ends."""
         return tags
 
+    def absent(self, paths: Sequence[Path]) -> str:
+        """Say that there is nothing in images of files, with the remedy."""
+        return self.nothing.format(count=len(paths))
+
+    def mirrored(self, paths: Sequence[Path]) -> int:
+        """Number of images of files that show something when they are mirrored."""
+        return sum(bool(self.find(np.fliplr(self.read(path)))[0]) for path in paths)
+
     def read(self, path: Path) -> FloatArray:
         """Read grey values (height, width) of an image, ignoring its orientation tag.
 
@@ -608,21 +616,24 @@ class Board(NamedTuple):
     kind: str  # chessboard or charuco
     rows: int  # of inner corners of a chessboard, of squares of a ChArUco board
     columns: int
+    first: int = 0  # number of the first tag on a ChArUco board
 
     @classmethod
     def of(cls, text: str) -> "Board":
         """Read such as ``chessboard:9x7``, 9 columns and 7 rows. Raises InputError for anything else."""
-        parts = re.fullmatch(rf"({'|'.join(_BOARDS)}):(\d{{1,3}})x(\d{{1,3}})", text)
+        parts = re.fullmatch(rf"({'|'.join(_BOARDS)}):(\d{{1,3}})x(\d{{1,3}})(?::first=(\d{{1,4}}))?", text)
         if parts is None or min(int(parts[2]), int(parts[3])) < LEAST_ROWS:
             raise InputError(
                 f"--board {text}: write kind:columnsxrows, of {LEAST_ROWS} or more, such as chessboard:9x7 "
-                "(inner corners) or charuco:11x8 (squares)"
+                "(inner corners), charuco:11x8 (squares), or charuco:11x8:first=20 where its first tag is 20"
             )
-        return cls(parts[1], int(parts[3]), int(parts[2]))
+        if parts[4] and parts[1] != "charuco":
+            raise InputError(f"--board {text}: a {parts[1]} has no tags: leave out first={parts[4]}")
+        return cls(parts[1], int(parts[3]), int(parts[2]), int(parts[4] or 0))
 
     def __str__(self) -> str:
-        """Kind, columns and rows."""
-        return f"{self.kind}:{self.columns}x{self.rows}"
+        """Kind, columns, rows, and the first tag unless it is 0."""
+        return f"{self.kind}:{self.columns}x{self.rows}" + (f":first={self.first}" if self.first else "")
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -655,21 +666,45 @@ class BoardFinder(Finder):
             f"no {board} in any of {{count}} images: check its kind and that it is counted in inner corners "
             "(chessboard) or squares (charuco), columns before rows, and show all of a chessboard"
         )
-        self._detectors = []
+        self._detectors, self._numbers = [], np.empty(0, dtype=np.int64)
         if board.kind == "charuco":
             tags, needed = _dictionary(dictionary), board.rows * board.columns // 2
-            if needed > len(tags.bytesList):
+            if board.first + needed > len(tags.bytesList):
+                after = f" from tag {board.first} on" if board.first else ""
                 raise InputError(
-                    f"a board {board} has {needed} tags, and dictionary {dictionary} {len(tags.bytesList)}: "
-                    "set the dictionary that it was printed with"
+                    f"a board {board} has {needed} tags{after}, and dictionary {dictionary} "
+                    f"{len(tags.bytesList)}: set the dictionary that it was printed with"
                 )
+            self._numbers = board.first + np.arange(needed)
+            size = board.columns, board.rows
             for legacy in (False, True):  # boards of even rows printed before OpenCV 4.6 begin otherwise
-                printed = self.cv.aruco.CharucoBoard((board.columns, board.rows), 1.0, _TAG_SHARE, tags)
+                printed = self.cv.aruco.CharucoBoard(size, 1.0, _TAG_SHARE, tags, self._numbers)
                 printed.setLegacyPattern(legacy)
                 aruco = self.cv.aruco
                 self._detectors.append(
                     aruco.CharucoDetector(printed, aruco.CharucoParameters(), _parameters())
                 )
+
+    def mirrored(self, paths: Sequence[Path]) -> int:
+        """Number of images of files that show the board when they are mirrored, if it has tags."""
+        return super().mirrored(paths) if self._detectors else 0
+
+    def absent(self, paths: Sequence[Path]) -> str:
+        """Say that the board is in no image, and which other tags of its dictionary are."""
+        seen = set[int]()
+        if self._detectors:
+            finder = self.cv.aruco.ArucoDetector(self._detectors[0].getBoard().getDictionary(), _parameters())
+            for path in paths:
+                numbers = finder.detectMarkers(self.read(path).astype(np.uint8))[1]
+                seen |= set() if numbers is None else {*np.ravel(numbers).tolist()}
+        if seen <= {*self._numbers.tolist()}:
+            return super().absent(paths)
+        low, high = self._numbers[[0, -1]]
+        return (
+            f"no {self.board} in any of {len(paths)} images: they show tags {min(seen)} to {max(seen)} of "
+            f"the dictionary, and the board has {low} to {high}: give the number of its first tag, as in "
+            f"{self.board._replace(first=min(seen))}"
+        )
 
     def find(self, image: FloatArray) -> tuple[dict[int, Corners], tuple[int, ...]]:
         """Corners (N, …) of the board in an image as tag 0, NaN where unseen; none without it.
@@ -714,9 +749,9 @@ class BoardFinder(Finder):
         return guess
 
     def _chessboard(self, grey: ByteArray) -> FloatArray:
-        """Corners (N, 2) of a chessboard by the first detector that finds it, px, NaN where covered.
+        """Corners (N, 2) of a chessboard by the first detector that finds it, px, NaN without it.
 
-        As OpenCV numbers them, the square after the first corner is brighter than its neighbours.
+        As OpenCV numbers them, the square after the first corner is bright, if a turn of the board makes it.
         """
         rows, columns = self.board.shape
         found, corners = self.cv.findChessboardCornersSB(
@@ -724,44 +759,19 @@ class BoardFinder(Finder):
         )
         if not found:  # obliquely seen boards are found by the older detector more often
             found, corners = self.cv.findChessboardCorners(grey, (columns, rows))
-        seen = corners.reshape(rows, columns, 2).astype(np.float64) if found else self._part(grey)
-        for grid in (np.rot90(seen, k) for k in range(4)):
+        if not found:
+            return np.full((rows * columns, 2), np.nan)
+        seen = corners.reshape(rows, columns, 2).astype(np.float64)
+        grids = [grid for grid in (np.rot90(seen, k) for k in range(4)) if grid.shape[:2] == self.board.shape]
+
+        def lightness(grid: FloatArray) -> float:
+            """Sum of grey values of the squares alike the first, less those of the others."""
             middles = 0.25 * (grid[1:, 1:] + grid[1:, :-1] + grid[:-1, 1:] + grid[:-1, :-1])
-            known = np.isfinite(middles[..., 0])
-            light = cast("FloatArray", grey[tuple(np.rint(middles[known]).astype(int).T[::-1])] - 128.0)
-            even = np.indices(known.shape).sum(axis=0)[known] % 2 == 0
-            if grid.shape[:2] == (rows, columns) and np.where(even, light, -light).sum() > 0.0:
-                return grid.reshape(-1, 2)
-        return np.full((rows * columns, 2), np.nan)
+            u, v = np.moveaxis(np.rint(middles).astype(np.int64), -1, 0)
+            even = np.indices(u.shape).sum(axis=0) % 2 == 0
+            return float(np.where(even, 1.0, -1.0).ravel() @ grey[v, u].ravel())
 
-    def _part(self, grey: ByteArray) -> FloatArray:
-        """Grid (r, c, 2) of the corners of a chessboard that is partly covered, px, NaN where covered.
-
-        It grows from the largest part without a gap. All four sides of the board must show, by two corners
-        each: else its numbers are not known, and the grid has another shape.
-        """
-        cv, least, most = self.cv, LEAST_ROWS, max(self.board.shape)
-        found, corners, part = cv.findChessboardCornersSBWithMeta(
-            grey, (least, least), cv.CALIB_CB_EXHAUSTIVE | cv.CALIB_CB_LARGER
-        )
-        if not found or max(part.shape) > most:
-            return np.empty((0, 0, 2))
-        places = np.indices((3 * most, 3 * most))[::-1].reshape(2, -1).T.astype(np.float64)
-        grid = np.full((3 * most, 3 * most, 2), np.nan)
-        grid[most : most + part.shape[0], most : most + part.shape[1]] = corners.reshape(*part.shape, 2)
-        image = grey.astype(np.float64)
-        for _ in range(most):
-            known = np.isfinite(grid[..., 0])
-            guess, steps = self._grid(places, grid.reshape(-1, 2))
-            next_to = (cv.dilate(known.astype(np.uint8), np.ones((3, 3))) > 0) & ~known
-            guess[~next_to.ravel()] = np.nan
-            fitted = _refine_saddles(image, guess, steps, np.inf)
-            new = fitted.clean.reshape(known.shape)
-            if not new.any():
-                break
-            grid[new] = fitted.pixels[fitted.clean]
-        r, c = (np.flatnonzero(known.sum(axis=axis) > 1) for axis in (1, 0))
-        return grid[r[0] : r[-1] + 1, c[0] : c[-1] + 1]
+        return max(grids, key=lightness).reshape(-1, 2)
 
 
 def _refine_saddles(image: FloatArray, guess: FloatArray, steps: FloatArray, cross: float) -> Corners:
@@ -946,8 +956,14 @@ def observe_tags(
                 findings.unrefined += int((~tag.clean).sum()) if in_corners else int(not tag.clean.all())
                 findings.images[k, view, number] = np.column_stack(tag[:2]) if in_corners else _center(tag)
         progress("detect", k + 1, len(pairs))
+    for view in sorted({*range(len(cameras))} - {view for _, view, _ in findings.images}):
+        if count := finder.mirrored([views[view] for _, *views in pairs]):
+            raise WorkFailed(
+                f"the {cameras[view]} images are mirrored: {count} of {len(pairs)} show tags in the mirror, "
+                "and none as they are: switch mirroring off in the driver, or mirror the files"
+            )
     if not findings.images:
-        raise WorkFailed(finder.nothing.format(count=len(cameras) * len(pairs)))
+        raise WorkFailed(finder.absent([path for _, *views in pairs for path in views]))
     numbers, each = findings.tags, finder.corners if points == "corners" else 1
     values = np.full((len(pairs), len(cameras), len(numbers), each, 3), np.nan)
     for (k, view, number), pixels in findings.images.items():
@@ -957,6 +973,11 @@ def observe_tags(
     values = values.reshape(len(pairs), len(cameras), len(marker), 3)
     images, sigma = values[..., :2], values[..., 2]
     observation = Observation(pose, marker, q, images, sigma=sigma, view=tuple(cameras))
+    if not np.isfinite(images).any():
+        raise WorkFailed(
+            f"all {images[..., 0].size} markers that were found are rejected, since their edges are not "
+            "clean: look for occlusion, blur, or cells of few pixels"
+        )
     if len(cameras) > 1 and (np.isfinite(images[..., 0]).sum(axis=1) < 2).all():
         both = "both" if len(cameras) == 2 else "two"
         raise WorkFailed(

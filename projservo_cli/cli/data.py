@@ -179,7 +179,8 @@ def _print_taught(console: Console, path: Path, taught: Any, check: Any, setting
 @click.option(
     "--board",
     metavar="KIND:CxR",
-    help="A board instead of tags: chessboard:9x7 (inner corners) or charuco:11x8 (squares).",
+    help="A board instead of tags: chessboard:9x7 (inner corners) or charuco:11x8 (squares), and "
+    "charuco:11x8:first=20 where its first tag is 20.",
 )
 @click.option(
     "--points",

@@ -12,7 +12,8 @@ DICTIONARY = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_250)
 def picture(board):
     """Grey values of a board with a margin of one square, and its corners (N, 2) in samples, row by row."""
     if board.kind == "charuco":
-        printed = cv2.aruco.CharucoBoard((board.columns, board.rows), 1.0, 0.7, DICTIONARY)
+        tags = board.first + np.arange(board.columns * board.rows // 2)
+        printed = cv2.aruco.CharucoBoard((board.columns, board.rows), 1.0, 0.7, DICTIONARY, tags)
         size = [CELL * (n + 2) for n in (board.columns, board.rows)]
         grey = printed.generateImage(size, marginSize=CELL)
     else:

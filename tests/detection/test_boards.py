@@ -68,24 +68,10 @@ def test_corners_err_as_they_say_in_images_of_all_kinds(kind):
     assert 0.75 < np.sqrt(np.mean(found.error**2) / np.mean(found.sigma**2)) < 1.3
 
 
-@pytest.mark.parametrize(("place", "code"), [(22, 0), (0, 0), (range(0, 54, 9), 1)])
-def test_a_chessboard_is_found_partly_covered_where_all_its_sides_show(rng, place, code):
-    board = Board.of("chessboard:9x6")
-    image, _ = drawn(board, view_of(rng, 30.0), 0.7, 2.0, rng)
-    whole = BoardFinder(board, "").find(image.astype(float))[0][0]
-    for u, v in np.rint(whole.pixels[np.atleast_1d(place)]).astype(int):
-        image[v - 18 : v + 18, u - 18 : u + 18] = 120
-    found = BoardFinder(board, "").find(image.astype(float))[0]
-    assert bool(found) == (code == 0)
-    if found:
-        known = np.isfinite(found[0].sigma)
-        assert 45 <= known.sum() < 54
-        off = np.linalg.norm(found[0].pixels - whole.pixels, axis=1)[known]
-        assert (off < 5.0 * np.hypot(found[0].sigma, whole.sigma)[known]).all()
-
-
 def test_case_36_a_chessboard_under_speckle_is_found_less_certain(projservo, shared_data, tmp_path):
-    case = shared_data / "cases/36_speckle_chessboard"
+    case = shared_data.parent / "cases/36_speckle_chessboard"
+    if not case.is_dir():
+        pytest.skip(f"case not found at {case}")
     answer = projservo(
         *("detect", f"left={case / 'im'}", "--joints-csv", case / "q.csv", "--board", "chessboard:11x8"),
         *("-o", tmp_path / "t.csv", "--json"),
@@ -189,11 +175,50 @@ def test_a_board_is_recorded_calibrated_taught_and_checked(projservo, monkeypatc
         stream.close()
 
 
+def test_a_board_whose_tags_begin_at_another_number(projservo, rng, monkeypatch, tmp_path):
+    """It is named by the tags that are seen; mirrored images and covered corners by what they are."""
+    monkeypatch.chdir(tmp_path)
+    board = Board.of("charuco:7x6:first=20")
+    image, corners = drawn(board, view_of(rng, 40.0), 0.7, 1.0, rng)
+    write("a/0.png", image)
+    write("mirror/0.png", image[:, ::-1].copy())
+    joints("q1", "1")
+    given = (
+        *("detect", "--joints-csv", "q.csv", "-o", "t.csv", "--dictionary", "4X4_250", "--board"),
+        str(board),
+    )
+    assert projservo(*given, "top=a").code == 0
+    table = read_table(Path("t.csv"))
+    assert np.linalg.norm(table.images[0, 0] - corners[table.marker], axis=1).max() < 0.5
+    Path("t.csv").unlink()
+    for said, *words in (
+        ("they show tags 20 to 40 of the dictionary, and the board has 0 to 20", "charuco:7x6", "top=a"),
+        ("the top images are mirrored: 1 of 1 show tags in the mirror", str(board), "top=mirror"),
+    ):
+        answer = projservo(*given[:-1], *words)
+        assert (answer.code, answer.err.count("\n")) == (1, 1)
+        assert said in answer.err
+        assert not Path("t.csv").exists()
+
+
+def test_case_37_mirrored_tags(projservo, shared_data, tmp_path):
+    case = shared_data.parent / "cases/37_mirrored_tags"
+    if not case.is_dir():
+        pytest.skip(f"case not found at {case}")
+    answer = projservo(
+        "detect", f"left={case / 'im'}", "--joints-csv", case / "q.csv", "-o", tmp_path / "t.csv"
+    )
+    assert (answer.code, answer.err.count("\n")) == (1, 1)
+    assert "the left images are mirrored: 2 of 2 show tags in the mirror, and none as they are" in answer.err
+    assert not (tmp_path / "t.csv").exists()
+
+
 REFUSED = {
     "--board circles:9x7": "write kind:columnsxrows",
     "--board chessboard:9x2": "of 3 or more",
     "--board charuco:20x20": "has 200 tags, and dictionary 4X4_50 50",
     "--board charuco:7x5 --dictionary 3X3": "--dictionary 3X3: unknown; valid: 4X4_100",
+    "--board chessboard:9x7:first=3": "a chessboard has no tags: leave out first=3",
     "--board chessboard:9x7 --points centers": "is of tags; a board has corners",
     "--board chessboard:9x7": "no chessboard:9x7 in any of 2 images",
 }
