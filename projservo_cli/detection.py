@@ -771,7 +771,7 @@ class BoardFinder(Finder):
             even = np.indices(u.shape).sum(axis=0) % 2 == 0
             return float(np.where(even, 1.0, -1.0).ravel() @ grey[v, u].ravel())
 
-        return max(grids, key=lightness).reshape(-1, 2)
+        return np.asarray(max(grids, key=lightness).reshape(-1, 2))
 
 
 def _refine_saddles(image: FloatArray, guess: FloatArray, steps: FloatArray, cross: float) -> Corners:
