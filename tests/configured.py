@@ -6,7 +6,7 @@ from types import ModuleType
 from typing import Any
 
 from projservo_cli.config import inputs as given
-from projservo_cli.config import load_config
+from projservo_cli.config import load_config, whole
 from projservo_cli.report import page
 from projservo_cli.settings.sections import JointVector
 from projservo_cli.simulation import faults, streams, workspace
@@ -19,7 +19,7 @@ from projservo_cli.stages import scenario
 from projservo_cli.stages import servo as driving
 from projservo_cli.stages import teach as teaching
 
-truth_of = given.truth_of
+truth_of = whole.truth_of
 
 
 class _Stage:

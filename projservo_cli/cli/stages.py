@@ -462,7 +462,7 @@ def _run_of(options: Mapping[str, Any], config: "Config") -> "Run":
 
 def _require_optional(config: Any, wanted: Sequence[str]) -> None:
     """Make sure, before any work, that ``view`` and ``animation`` can be made where they are wanted."""
-    from projservo_cli.config.inputs import truth_of
+    from projservo_cli.config.whole import truth_of
     from projservo_cli.records import InputError
     from projservo_cli.report.animation import plotly
 

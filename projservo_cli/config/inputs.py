@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from projservo_cli.config.loading import Config, stored_yaml
-from projservo_cli.config.whole import name_of_carrier
+from projservo_cli.config.whole import name_of_carrier, truth_of
 from projservo_cli.control.law import Gains
 from projservo_cli.detection import Board
 from projservo_cli.display import About
@@ -28,12 +28,10 @@ from projservo_cli.simulation.described import (
     cameras_of,
     center_in_face,
     described_scene,
-    described_truth,
 )
 from projservo_cli.simulation.faults import SimulatedRobot
 from projservo_cli.simulation.mjcf import files_named
 from projservo_cli.simulation.rendering import RenderedScene
-from projservo_cli.simulation.streams import NORMAL, NoiseShape
 from projservo_cli.simulation.workspace import SceneObject, Truth
 from projservo_cli.stages.stage_inputs import (
     CalibrationInputs,
@@ -417,31 +415,6 @@ def _read(config: Config, kind: str, gone: Mapping[str, str]) -> File | None:
 
 
 # Robot, rig and markers.
-
-
-def truth_of(config: Config, *, face: bool = True) -> Truth:
-    """Robot, rig and markers as they are; an InputError where a part of it is missing.
-
-    The same values give the same object, so that derived results are kept.
-    face : whether it has the face, of which a calibration knows nothing.
-    """
-    if config.arm is None:
-        raise InputError("this stage drives a simulated robot: set robot.dh or robot.screws")
-    if config.rig is None:
-        raise InputError("this stage needs a simulated rig: set rig.left, rig.right and rig.image_size_px")
-    if config.markers is None or config.markers.points is None:
-        raise InputError("this stage needs the markers of the simulated robot: set markers.positions_m")
-    rendered, n = config.plant.rendered, config.noise
-    if rendered is not None and any(any(camera.lens) for camera in config.rig.cameras.values()):
-        raise InputError(
-            "rig: lens is that of cameras that see points: of rendered ones set plant.options.k1"
-        )
-    factor = n.outlier_factor if n.outlier_share else NORMAL.outlier_factor
-    noise = NoiseShape(math.inf if n.tail_dof is None else n.tail_dof, n.outlier_share, factor)
-    markers = config.markers if face else config.markers.model_copy(update={"center": "midpoint"})
-    return described_truth(
-        config.arm, config.rig, markers, noise, face, 0.0 if rendered is None else rendered.k1
-    )
 
 
 def scene_of(

@@ -22,7 +22,7 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from projservo_cli.config.sweep import SweepConfig
-from projservo_cli.config.whole import Settings
+from projservo_cli.config.whole import Settings, truth_of
 from projservo_cli.display import checked_array, plain, require_radians
 from projservo_cli.files import bytes_of, text_of
 from projservo_cli.passwords import masked
@@ -364,7 +364,6 @@ class Config(Settings):
         InputError
             If the configuration lacks arm, rig or markers, or the readings have another shape.
         """
-        from projservo_cli.config.inputs import truth_of
         from projservo_cli.report import figures  # so that those who draw nothing need not import all figures
 
         return figures.of_scene(truth_of(self), self._readings("plot", q))

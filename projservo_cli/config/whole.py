@@ -1,6 +1,7 @@
 """The configuration as a whole; every key has its unit in its name."""
 
 import inspect
+import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Annotated, Any, Self, cast
@@ -22,6 +23,9 @@ from projservo_cli.settings.robot import Rig, RobotSettings, like_degrees
 from projservo_cli.settings.sections import Finding, JointVector, Root, Whole
 from projservo_cli.settings.task import Goal, GoalImages, TaskSettings, TaskStep, Trajectory, sigma_key
 from projservo_cli.settings.trials import CalibrationSettings, Data, Noise
+from projservo_cli.simulation.described import described_truth
+from projservo_cli.simulation.streams import NORMAL, NoiseShape
+from projservo_cli.simulation.workspace import Truth
 
 
 def _folder_name(name: str) -> str:
@@ -516,3 +520,28 @@ class Settings(Printed, Root):
             known = tuple(size for size in sizes if size is not None)
             return None if len(known) < len(sizes) else known[0] if len({*known}) == 1 else known
         return cast(ImageSize, self.rig.image_size_px) if self.rig is not None else None
+
+
+def truth_of(config: Settings, *, face: bool = True) -> Truth:
+    """Robot, rig and markers as they are; an InputError where a part of it is missing.
+
+    The same values give the same object, so that derived results are kept.
+    face : whether it has the face, of which a calibration knows nothing.
+    """
+    if config.arm is None:
+        raise InputError("this stage drives a simulated robot: set robot.dh or robot.screws")
+    if config.rig is None:
+        raise InputError("this stage needs a simulated rig: set rig.left, rig.right and rig.image_size_px")
+    if config.markers is None or config.markers.points is None:
+        raise InputError("this stage needs the markers of the simulated robot: set markers.positions_m")
+    rendered, n = config.plant.rendered, config.noise
+    if rendered is not None and any(any(camera.lens) for camera in config.rig.cameras.values()):
+        raise InputError(
+            "rig: lens is that of cameras that see points: of rendered ones set plant.options.k1"
+        )
+    factor = n.outlier_factor if n.outlier_share else NORMAL.outlier_factor
+    noise = NoiseShape(math.inf if n.tail_dof is None else n.tail_dof, n.outlier_share, factor)
+    markers = config.markers if face else config.markers.model_copy(update={"center": "midpoint"})
+    return described_truth(
+        config.arm, config.rig, markers, noise, face, 0.0 if rendered is None else rendered.k1
+    )

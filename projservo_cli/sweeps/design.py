@@ -13,8 +13,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from projservo_cli.config import Config, Override, load_config, to_yaml
-from projservo_cli.config.inputs import calibration_inputs, truth_of
+from projservo_cli.config.inputs import calibration_inputs
 from projservo_cli.config.sweep import BASE, LAW, Distribution, SweepConfig
+from projservo_cli.config.whole import truth_of
 from projservo_cli.laws import law_and_mode, run_names
 from projservo_cli.records import FloatArray, InputError, IntArray
 from projservo_cli.result_hashes import digest, key_of

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 import projservo_cli as projservo
-from projservo_cli.config.inputs import truth_of
+from projservo_cli.config.whole import truth_of
 from projservo_cli.geometry.kinematics import project
 from projservo_cli.image_size import within_images
 from projservo_cli.records import WorkFailed

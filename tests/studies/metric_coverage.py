@@ -13,7 +13,7 @@ import numpy as np
 from scipy.stats import chi2
 
 import projservo_cli as projservo
-from projservo_cli.config.inputs import truth_of
+from projservo_cli.config.whole import truth_of
 from projservo_cli.metric.frame import Metric
 from projservo_cli.metric.kinematic_errors import in_model_frames
 from projservo_cli.records import WorkFailed
