@@ -434,7 +434,10 @@ def _require_confirmed(camera: _Camera) -> float:
 def _record(
     c: Calibration, observation: Observation, camera: _Camera, ratio: float, limit_px: float
 ) -> Calibration:
-    """Calibration with a camera as fitted, at so many times the expected noise; no limit: of the extent."""
+    """Calibration with a camera as fitted, at a ratio to the expected noise.
+
+    limit_px : error above which it is not usable; infinite to take that of the extent of the images.
+    """
     images, v, which, rows = camera.images, camera.v, camera.images.which, rows_of_camera(c, camera.v)
     found, count, errors = images.problem.detections, len(rows), errors_of_others(images.calibration, v)
     common, own = images.changes(camera.params, errors)

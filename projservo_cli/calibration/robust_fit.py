@@ -273,7 +273,7 @@ class Expected:
     scale: float | None = None  # true over stated deviations, if the images determine it
     scale_interval: FloatArray | None = None  # (2,) of 95 %
     shown: str = ""  # who shows it, for messages
-    min_px: float = 0.0  # its least, where it is estimated
+    min_px: float = 0.0  # least noise of pixels where it is estimated, px; zero where it is known
 
     @classmethod
     def of(
@@ -297,8 +297,8 @@ class Expected:
             return cls(stated_px, False, origin, _STATED_ERROR, 1.0, interval, min_px=epipolar.min_px)
         scale = epipolar.core.sigma_px / stated_px
         origin = f"{origin}, times {scale:.3g} (95 %: {low:.3g} to {high:.3g}) as {epipolar.shown}"
-        shown, stated = (epipolar.shown, epipolar.min_px), scale * stated_px
-        return cls(stated, False, origin, _STATED_ERROR, scale, interval, *shown)
+        stated_px, shown, min_px = scale * stated_px, epipolar.shown, epipolar.min_px
+        return cls(stated_px, False, origin, _STATED_ERROR, scale, interval, shown, min_px)
 
     def require_scale(self, view: Sequence[str]) -> None:
         """Refuse stated deviations that are wrong by more than a detector can explain.
