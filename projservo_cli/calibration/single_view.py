@@ -233,14 +233,13 @@ def _explaining(
     return sorted([*bodies, *others], key=lambda body: body.cost)
 
 
-def _factorised(images: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _factorised(images: FloatArray, placed: BoolArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Affine cameras A (K, 2, 3) and b (K, 2), and a shape (m, 3), of images (K, m, 2), NaN if unseen.
 
-    By alternating least squares from the markers that are seen together most often, since others are missing,
-    and under a Cauchy loss, since some are wrong.
+    By alternating least squares from markers (m,) that are seen together, since others are missing, and under
+    a Cauchy loss, since some are wrong.
     """
     seen, known = np.isfinite(images[..., 0]), np.nan_to_num(images)
-    placed = _together(seen)
     whole = seen[:, placed].all(axis=1)
     block = known[whole][:, placed]
     rows = (block - block.mean(axis=1, keepdims=True)).swapaxes(1, 2).reshape(-1, np.count_nonzero(placed))
@@ -273,7 +272,8 @@ def _together(seen: BoolArray) -> BoolArray:
     chosen, whole = np.zeros(seen.shape[1], dtype=np.bool_), np.ones(len(seen), dtype=np.bool_)
     for _ in range(_LEAST_MARKERS + 1):
         count = np.where(chosen, -1, np.count_nonzero(seen & whole[:, None], axis=0))
-        if (best := int(np.argmax(count))) >= 0 and count[best] >= _LEAST_POSES:
+        best = int(np.argmax(count))
+        if count[best] >= _LEAST_POSES:
             chosen[best] = True
             whole &= seen[:, best]
     return chosen
@@ -299,8 +299,14 @@ def _upgraded(A: FloatArray, X: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _deep_starts(images: FloatArray, focals: FloatArray, middle: FloatArray) -> list[_Start]:
-    """Starts of a body that is not flat: of both reflections at each focal length, px."""
-    A, b, X = _factorised(images)
+    """Starts of a body that is not flat: of both reflections at each focal length, px.
+
+    Empty if too few markers are seen together.
+    """
+    together = _together(np.isfinite(images[..., 0]))
+    if np.count_nonzero(together) < _LEAST_MARKERS:
+        return []
+    A, b, X = _factorised(images, together)
     A, X = _upgraded(A, X)
     sides = (np.array([1.0, 1.0, side]) for side in (1.0, -1.0))
     return [_posed(A * side, b, X * side, focal, middle) for side in sides for focal in focals.tolist()]

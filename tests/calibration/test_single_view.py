@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from projservo_cli.calibration.detections import Detections
 from projservo_cli.calibration.epipolar import ImageFrame
 from projservo_cli.calibration.single_view import RigidBody
-from projservo_cli.records import Observation
+from projservo_cli.records import Observation, WorkFailed
 from projservo_cli.settings.markers import Markers
 from tests.calibration.simulated_robot import around, random_robot, trials
 
@@ -49,3 +49,15 @@ def test_a_body_is_seen_in_its_sense_of_depth_though_small_turns_hardly_show_it(
     found = RigidBody.of(detections, ImageFrame.of(detections, None))
     assert found.sigma_px == pytest.approx(sigma_px, rel=0.3)
     np.testing.assert_allclose(found.bodies[0].focal, 1200.0, rtol=0.1)
+
+
+def test_images_that_share_no_markers_are_refused_and_no_error():
+    """Each marker is seen often, and no four of them in four poses."""
+    rng = np.random.default_rng(6)
+    robot = random_robot("RRR", rng, markers=40, views=1)
+    observation = robot.observe(around(robot, 40, rng), 0.3, rng)
+    for image in observation.images:
+        image[:, rng.permutation(40)[6:]] = np.nan
+    detections = Detections.of(observation, "RRR")
+    with pytest.raises(WorkFailed, match="no rigid body explains"):
+        RigidBody.of(detections, ImageFrame.of(detections, None))
