@@ -112,6 +112,7 @@ _STATISTICS = "statistics.json"
 
 
 def _drawn(data: Any, draw: Any) -> Any:
+    """Draw a figure in its size; that of the basin is the larger one."""
     height, width = (4.0, style.WIDTH) if draw is draw_basin else (2.9, 0.65 * style.WIDTH)
     return style.drawn(draw, data, height, width)
 

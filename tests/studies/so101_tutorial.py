@@ -67,6 +67,16 @@ def through_all(span=75.0):
     return [np.clip(q, -130.0, 130.0) for q in ends]
 
 
+def until_taught(arm):
+    """Commands from an empty folder to a taught goal, and what a person does at each Enter."""
+    return (
+        (["init", "--arm", "so101", "arm.yaml"], []),
+        (["limits", "-c", "arm.yaml"], [None, by_hand(arm, *through_all())]),
+        (["teach", "--start", "-c", "arm.yaml"], [None, by_hand(arm, START), None]),
+        (["teach", "-c", "arm.yaml"], [None, by_hand(arm, GOAL), None]),
+    )
+
+
 @contextmanager
 def benched(folder, monkeypatch, rate=RATE, rate_hz=15.0, settings=()):
     """An emulated arm with its cameras, and somebody who presses Enter, in a folder.
@@ -161,10 +171,7 @@ def test_ten_commands_lead_from_an_empty_folder_to_the_taught_goal(bench, capsys
 def test_one_webcam_is_enough_to_teach_record_and_calibrate(bench, capsys):
     arm = bench.arm
     for words, acts in (
-        (["init", "--arm", "so101", "arm.yaml"], []),
-        (["limits", "-c", "arm.yaml"], [None, by_hand(arm, *through_all())]),
-        (["teach", "--start", "-c", "arm.yaml"], [None, by_hand(arm, START), None]),
-        (["teach", "-c", "arm.yaml"], [None, by_hand(arm, GOAL), None]),
+        *until_taught(arm),
         (["record", "calibrate", "-c", "arm.yaml", "-o", "run"], []),
     ):
         bench.script[:] = acts
@@ -194,10 +201,7 @@ def test_a_camera_that_moved_is_refitted_by_the_commands_of_doctor_and_stays_so(
         return told
 
     for words, acts in (
-        (["init", "--arm", "so101", "arm.yaml"], []),
-        (["limits", "-c", "arm.yaml"], [None, by_hand(arm, *through_all())]),
-        (["teach", "--start", "-c", "arm.yaml"], [None, by_hand(arm, START), None]),
-        (["teach", "-c", "arm.yaml"], [None, by_hand(arm, GOAL), None]),
+        *until_taught(arm),
         (["record", "calibrate", "-c", "arm.yaml", "-o", "results/arm"], []),
     ):
         bench.script[:] = acts
