@@ -108,7 +108,7 @@ class Observations(Displayable, Observation):
         """
         names = VIEWS if view is None else tuple(view)
         if isinstance(view, str) or not all(map(is_view, names)) or not 0 < len({*names}) == len(names):
-            raise InputError(f"view: {view!r}: expected names of small letters and digits, each once")
+            raise InputError(f"view: {view!r}: expected names of small letters, digits and spaces, each once")
         if mount not in (WORLD, TOOL):
             raise InputError(f"mount: {mount!r}: expected {WORLD} or {TOOL}")
         V = len(names)

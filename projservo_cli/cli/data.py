@@ -282,7 +282,7 @@ def _sources(images: tuple[str, ...]) -> dict[str, str]:
         if not (is_view(name) and rest):
             raise click.UsageError(
                 f"{image}: give the images of left and right, or NAME=IMAGES of each camera, such as "
-                "top=images/top: names have small letters, digits and _"
+                "top=images/top: names have small letters, digits, _ and single spaces"
             )
     if len({name for name, _ in named}) < len(named):
         raise click.UsageError("two cameras have one name: name each once")

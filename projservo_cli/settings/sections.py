@@ -107,7 +107,10 @@ class ByView(Section):
         """Yield names that no column of a table can have."""
         for name in self.model_extra or ():
             if not is_view(name):
-                yield (name,), "is no name of a camera: take small letters and digits, such as top or cam_2"
+                yield (
+                    (name,),
+                    "is no name of a camera: take small letters, digits and single spaces, as cam 2",
+                )
 
 
 class Root(Section):
