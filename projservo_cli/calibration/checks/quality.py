@@ -267,12 +267,13 @@ def assess(
         short = f"the closed_form method explains the images only to {found}"
         reason = f"{short}, {share:.3g} times {wanted}: use bundle_adjustment"
         return _Assessment(span, noise, error, None, False, reason, (), "the method", ())
-    reason = f"residuals of {found} agree with {wanted}"
+    reason, notes = f"residuals of {found} agree with {wanted}", list[str]()
     if warned:
         reason = f"more than pixel noise is left: residuals of {found} are {share:.3g} times {wanted}"
         if "joint readings" in suspicion and not (check and check.errors):
-            advice.insert(0, "look for joint readings that lag behind the images")
-    (suspects, swaps), notes = rejected, []
+            notes.append("look for joint readings that lag behind the images")
+            advice[:0] = notes
+    suspects, swaps = rejected
     outliers, observations = len(outlier), solution.used.shape[1]
     limit, many = "noise", outliers > _MAX_OUTLIERS * observations
     alike = _describe_shared(outlier, solution.problem.detections)
@@ -288,10 +289,11 @@ def assess(
         if over > 1.0:
             moved = f"move images by {moved_px:.3g} px"
             limit = f"joint readings, which {moved}"
-            notes = [
+            finer = (
                 f"errors of joint readings {moved}, more than pixel noise: finer or stiffer joints would help"
-            ]
-            advice += notes
+            )
+            advice.append(finer)
+            notes.append(finer)
     of_outliers = f"outliers: {outliers} of {observations}{alike}"
     if warned or suspicion == "lens":
         limit = of_outliers if suspicion == "outliers" else suspicion
@@ -317,6 +319,7 @@ def assess(
         advice.append(f"{times} a marker was seen under the number of another: check the numbering")
     if outliers and not many:
         advice.append(outlier_advice)
+    if outliers and not (many and limit == of_outliers):
         notes.append(outlier_advice)
     reason = f"{reason}; limited by {limit}"
     return _Assessment(span, noise, error, check, usable, reason, tuple(advice), limit, tuple(notes))
