@@ -216,6 +216,10 @@ def test_a_camera_that_moved_is_refitted_by_the_commands_of_doctor_and_stays_so(
     assert mend["view"] == "left"
     for command in mend["commands"]:
         call(command.split()[1:])
+    # The goal shows the left camera where it stood before.
+    assert "teach it again" in call(["plan", "-c", "arm.yaml", "-o", "results/arm_refit"], 1).err
+    bench.script[:] = [None, by_hand(arm, GOAL), None]
+    call(["teach", "results/arm_refit", "-c", "arm.yaml", "--force"])
     told = call(["servo", "-c", "arm.yaml", "-o", "results/arm_refit"])
     assert "calibrate: making" not in told.err
     assert "converged" in told.out
