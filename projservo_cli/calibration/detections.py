@@ -83,7 +83,7 @@ class Detections:
     pixels: FloatArray  # (V, N, 2) px, zero where not seen
     seen: BoolArray  # (V, N) whether the view saw the marker
     weight: FloatArray  # (V, N) weights of residuals: ``stated_px`` over the standard deviation, or one
-    stated_px: float | None  # root mean square of the stated standard deviations, px, if any
+    stated_px: float | None  # median of the stated standard deviations, px, if any
     view: tuple[str, ...] = VIEWS  # names of the views
     mount: str = WORLD  # of cameras on the tool, the chain is that of the scene: joints in reverse, negated
     pair: tuple[int, ...] = (0, 1)  # the one or two views by which a fit begins and noise is known
@@ -111,7 +111,8 @@ class Detections:
         weight, stated_px = np.ones(seen.shape), None
         if observation.sigma is not None and seen.any():
             sigma = np.maximum(observation.sigma[pose_of, :, marker_of].T[seen], MIN_SIGMA)
-            stated_px = float(np.sqrt(np.mean(sigma**2)))
+            # Their root mean square would be that of the few loosest, which hardly count.
+            stated_px = float(np.median(sigma))
             weight[seen] = stated_px / sigma
         q, prismatic = np.array(observation.q, dtype=np.float64), prismatic_of(letters)
         if mount == TOOL:

@@ -124,7 +124,7 @@ def calibrate(
     observation : stereo images of the markers at a sequence of poses, raw px, NaN where unseen.
     joint_types : one letter a joint, R or P.
     method : ``bundle_adjustment`` (maximum likelihood) or ``closed_form`` (eqs. 4, 5).
-    sigma_px : noise per coordinate, px; None takes the root mean square of the observation's ``sigma``,
+    sigma_px : noise per coordinate, px; None takes the median of the observation's ``sigma``,
         for a recording times the common factor that both views show, else estimates it from the epipolar
         geometry. The sigma of a detection sets its weight.
     source : ``simulated`` (χ² decides against ``sigma_px``) or ``recorded``.

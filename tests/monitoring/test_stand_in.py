@@ -7,6 +7,8 @@ from projservo_cli.monitoring.image_monitor import detected_fault
 from tests.monitoring.stand_in import IMAGE, StandIn
 from tests.studies.monitoring import Rig, calibrated, driven, tasks
 
+_BENT = np.array([[-0.15, 0.2], [-0.4, 0.1], [0.6, -0.5], [0.5, 0.15]])  # px
+
 
 @pytest.mark.parametrize(
     ("rig", "number", "level"),
@@ -20,17 +22,22 @@ def test_what_has_passed_is_no_fault(rig, number, level):
 
 
 @pytest.mark.parametrize(
-    ("bent", "shift", "named"),
-    [((), 0.0, ""), ((1, 4), 0.0, ""), ((1, 4), 3.0, "left camera"), ((0, 1, 4), 0.0, "marker")],
+    ("bent", "by", "shift", "named"),
+    [
+        ((), 0.0, 0.0, ""),
+        ((1, 4), 1.0, 0.0, ""),
+        ((1, 4), 1.0, 3.0, "left camera"),
+        ((0, 1, 4), 2.0, 0.0, "marker"),
+    ],
 )
-def test_tags_that_are_bent_in_one_posture_are_no_fault_and_hide_no_camera(bent, shift, named):
+def test_tags_that_are_bent_in_one_posture_are_no_fault_and_hide_no_camera(bent, by, shift, named):
     # Corners of a slanted tag that are off by up to 0.8 px, as a detector of sharp images has them.
     rig = Rig("five", "finder", 0.0, 0.0)
     goal = next(tasks(rig, np.random.default_rng(1)))[1]
     robot, size = StandIn(**rig.options(at_deg=goal, seed=2)), np.array(IMAGE, dtype=float)
     q, s = robot.read()[:2]
     for tag in bent:
-        s[:, 4 * tag : 4 * tag + 4] += [[-0.15, 0.2], [-0.4, 0.1], [0.6, -0.5], [0.5, 0.15]]
+        s[:, 4 * tag : 4 * tag + 4] += by * _BENT
     s[0] += shift
     fault = detected_fault(calibrated(rig), q, np.arange(20), s, size)
     assert named in fault if named else fault == ""

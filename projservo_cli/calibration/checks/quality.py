@@ -81,8 +81,12 @@ class _Uncertainty:
         return np.asarray(((pixels >= low) & (pixels <= high)).all(axis=-1))
 
     def spread(self, q: FloatArray, *, nearer: bool = False) -> FloatArray:
-        """Changes (rows, r) of visible coordinates at poses (K, n) by independent errors of size one."""
-        return self.predictions(q, nearer=nearer).T
+        """Changes (rows, r) of visible coordinates at poses (K, n), in the noise of their markers."""
+        found, detections = self.predictions(q, nearer=nearer), self.problem.detections
+        marker = found.there.detections.marker_of[np.nonzero(found.inside)[1]]
+        square = np.bincount(detections.marker_of, (detections.seen * detections.weight**2).sum(axis=0))
+        weight = np.sqrt(square / np.bincount(detections.marker_of, detections.seen.sum(axis=0)))
+        return np.repeat(weight[marker], 2)[:, None] * found.T
 
     def predictions(self, q: FloatArray, *, nearer: bool = False) -> "_Predictions":
         """Predicted images at poses (K, n).
