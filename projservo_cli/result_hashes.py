@@ -16,6 +16,47 @@ import numpy as np
 from projservo_cli.passwords import masked
 from projservo_cli.records import InputError
 
+# Types whose records are keyed by the module in which they stood first: one that moves keeps its name here,
+# so that results of users stay valid. Other types are keyed by their own names, each of which must be unique.
+_FIRST_MODULES = {
+    "control.law": "Gains",
+    "detection": "Board",
+    "display": "About",
+    "records": "JointLimits",
+    "robots.settings": "Following JointSettings SpeedLimits",
+    "settings.cameras": "Cameras Source",
+    "settings.control": "RenderedOptions Stop",
+    "settings.disturbance": (
+        "Disturbance EachView Events Faults JointMoved LostMarkers StuckEncoder _CameraMoved "
+        "_MarkerMoved _ObjectMoved"
+    ),
+    "settings.markers": "Tag",
+    "settings.features": "Feature Pair",
+    "settings.objects": "Displacement ObjectSettings Objects",
+    "settings.sections": "JointVector",
+    "settings.task": (
+        "DisplacedAlong Goal GoalImages KeptOut TaskSettings TaskStep Trajectory _Approach "
+        "_ObjectImages _Perturbation _Search"
+    ),
+    "simulation.arm": "SerialArm",
+    "simulation.faults": "SimulatedRobot",
+    "simulation.rendering": "RenderedScene",
+    "simulation.streams": "NoiseShape",
+    "simulation.workspace": "SceneObject Truth",
+    "stages.stage_inputs": (
+        "CalibrationInputs CarryingObject Contract Drive Estimation KnownLengths Motions OwnRobot "
+        "PlanInputs PreflightInputs RecordingInputs RefitInputs ReportInputs Scenery ServoInputs "
+        "SuggestionInputs Table TeachInputs Trials"
+    ),
+    "task.incidences": "Incidence",
+    "task.stand_off": "StandOff",
+}
+_KINDS = {
+    name: f"projservo_cli.{module}:{name}"
+    for module, names in _FIRST_MODULES.items()
+    for name in names.split()
+}
+
 
 class File(NamedTuple):
     """A file that a stage reads, which may lie anywhere."""
@@ -75,8 +116,8 @@ def _canonical(value: Any) -> Any:
     if isinstance(value, np.ndarray):
         return {"array": [value.dtype.str, value.shape, value.tobytes().hex()]}
     if (fields := _fields(value)) or hasattr(type(value), "model_fields"):
-        kind = f"{type(value).__module__}:{type(value).__qualname__}"
-        return {kind: {name: _canonical(inner) for name, inner in fields.items()}}
+        name = type(value).__qualname__
+        return {_KINDS.get(name, name): {key: _canonical(inner) for key, inner in fields.items()}}
     if isinstance(value, dict):
         return {"mapping": {key: _canonical(value[key]) for key in sorted(value)}}
     if isinstance(value, (tuple, list)):

@@ -16,6 +16,8 @@ PASSING = {
 }
 PLACEHOLDER = b"This is a netCDF dimension but not a netCDF variable"
 SENTENCE = re.compile(r"\w \w+[,:;]? \w")  # texts of three words or more
+# Expressions on names of an earlier version, and the names that stand there now: what moves is not lost.
+RENAMED: tuple[tuple[str, str], ...] = ()
 NEAR = 1e-9  # of the largest number of an array: where arithmetic was touched
 
 
@@ -69,8 +71,16 @@ def plain(array: np.ndarray, folder: Path) -> np.ndarray:
     return array
 
 
+def renamed(name: str) -> str:
+    """A name of an earlier version as it is now, by each of ``RENAMED`` in turn."""
+    for pattern, now in RENAMED:
+        name = re.sub(pattern, now, name)
+    return name
+
+
 def differences(old: Mapping[str, np.ndarray], new: Mapping[str, np.ndarray]) -> dict[str, list[str]]:
     """Names that are ``equal`` to the bit, ``near``, ``reworded``, ``apart``, ``lost`` and ``new``."""
+    old = {renamed(name): value for name, value in old.items()}
     told: dict[str, list[str]] = {kind: [] for kind in ("equal", "near", "reworded", "apart", "lost", "new")}
     for name in sorted({*old, *new}):
         if name not in new or name not in old:

@@ -1,15 +1,20 @@
 """Keys: a stage reads what its key is made of and nothing else, and a key is made of no more than that."""
 
+import contextlib
 import dataclasses
+import json
 import shutil
 import sys
+from collections import namedtuple
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from projservo_cli.config import load_config
 from projservo_cli.config.inputs import calibration_inputs, files_of, plan_inputs, report_inputs, servo_inputs
+from projservo_cli.records import WorkFailed
 from projservo_cli.result_hashes import encoded, key_of
 from projservo_cli.simulation.mjcf import files_named
 from projservo_cli.stages import calibrate, plan, servo
@@ -38,6 +43,7 @@ CASES = {
     ),
 }
 LAW = "exact"
+STORED = Path(__file__).with_name("keys.json")
 
 
 def configured(case, *overrides):
@@ -135,6 +141,36 @@ def test_a_key_is_made_of_what_the_stage_reads(name, stage, stays, change):
     assert (keys[0] == keys[1]) == stays
 
 
+def keys_of_shipped():
+    """The key of each stage of each shipped configuration that this machine can read."""
+    found = {}
+    for path in sorted((ROOT / "configs").glob("*.yaml")):
+        if "\ngrid:" in path.read_text(encoding="utf-8"):
+            continue
+        with contextlib.suppress(WorkFailed):  # without MuJoCo
+            config = load_config(path)
+            found |= {f"{path.stem}/{stage}": key_of(given(config)) for stage, given in GIVEN.items()}
+    return found
+
+
+def test_results_of_users_stay_valid():
+    """Keys of shipped configurations are as stored: they change with what a stage makes, and not with code.
+
+    Where a layout or a number is meant to change, ``python -m tests.stages.test_keys`` stores them again.
+    """
+    stored = json.loads(STORED.read_text(encoding="utf-8"))
+    found = keys_of_shipped()
+    assert found.keys() <= stored.keys()
+    assert len(found) >= 4 * len(CASES)
+    assert {name: stored[name] for name in found} == found
+
+
+def test_a_type_that_moves_keeps_its_key():
+    first, named = (namedtuple(name, "x") for name in ("Gains", "Other"))
+    assert encoded(first(1)) == b'{"projservo_cli.control.law:Gains":{"x":1}}'
+    assert encoded(named(1)) == b'{"Other":{"x":1}}'
+
+
 def test_tables_and_goal_files_count_by_their_content(tmp_path):
     config = configured("ur5", "calibration.cross_validate=null")
     table = tmp_path / "trials.csv"
@@ -202,3 +238,7 @@ def test_canonical_bytes_tell_values_apart():
         assert encoded(decoded(encoded(value), {})) == encoded(value)
     with pytest.raises(TypeError, match="object has no canonical bytes"):
         encoded(object())
+
+
+if __name__ == "__main__":
+    STORED.write_text(json.dumps(keys_of_shipped(), indent=1) + "\n", encoding="utf-8")
