@@ -22,16 +22,16 @@ def picture(board):
     return grey.astype(np.uint8), CELL * (board.places + 2) - 0.5
 
 
-def drawn(board, H, blur, noise, rng, size=SIZE):
+def drawn(board, H, blur, noise, rng, size=SIZE, factor=FACTOR):
     """Image of a board, of which a homography takes squares from its middle to pixels, and its corners."""
     grey, corners = picture(board)
     middle = board.places.mean(axis=0)
     places = np.diag([1.0 / CELL, 1.0 / CELL, 1.0])
     places[:2, 2] = board.places[0] - middle - corners[0] / CELL
-    fine = np.array([[FACTOR, 0.0, (FACTOR - 1) / 2], [0.0, FACTOR, (FACTOR - 1) / 2], [0.0, 0.0, 1.0]])
-    large = (size[0] * FACTOR, size[1] * FACTOR)
+    fine = np.array([[factor, 0.0, (factor - 1) / 2], [0.0, factor, (factor - 1) / 2], [0.0, 0.0, 1.0]])
+    large = (size[0] * factor, size[1] * factor)
     image = cv2.warpPerspective(grey, fine @ H @ places, large, borderValue=200)
-    image = image.reshape(size[1], FACTOR, size[0], FACTOR).mean(axis=(1, 3))
+    image = image.reshape(size[1], factor, size[0], factor).mean(axis=(1, 3))
     image = cv2.GaussianBlur(image, (0, 0), blur) if blur else image
     image = 20 + 0.8 * image + noise * rng.standard_normal(image.shape)
     true = np.c_[board.places - middle, np.ones(len(corners))] @ H.T
