@@ -6,7 +6,7 @@ It pairs images with joint readings, finds tags by OpenCV, refines their corners
 import math
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -136,7 +136,7 @@ _MOSAIC = 0.04
 _BOARDS, LEAST_ROWS = ("chessboard", "charuco"), 3
 # Share of a square that a tag takes up on a ChArUco board: what OpenCV draws; the edges decide on corners.
 _TAG_SHARE = 0.75
-# Minimum number of corners of a board in an image, for the directions of its edges.
+# Minimum number of corners of a board in an image, not of one line, for the directions of its edges.
 _LEAST_CORNERS = 6
 # Distance from a corner up to which pixels count, in squares, and at most, px.
 _REACH, _MAX_REACH_SADDLE = 0.6, 10.0
@@ -146,6 +146,14 @@ _CROSS, _MIN_CROSS = 0.1, 1.5
 _MIN_SQUARE, _UNREFINED_SADDLE = 5.0, 0.3
 # Number of parameters of a corner, steps of their fit, and error of the model, px.
 _SADDLE, _SADDLE_STEPS, _SADDLE_FLOOR = 7, 12, 0.001
+# Blur of an image in which saddles are looked for, px, their number over that of corners, and of starts.
+_SEED_BLUR, _SADDLES, _STARTS = 1.5, 4, 40
+# Depth of the next saddle, as a share, at least, and slope of the way to it against an edge, at most.
+_FAINT, _SLOPE = 0.1, 0.2
+# Difference of a contrast, as a share, deviation, in squares, and squares beyond the known ones, at most.
+_UNLIKE, _VAGUE, _GAP = 0.6, 0.01, 3
+# Deviations from the smooth map of the others above which a corner is rejected, and the degree of the map.
+_OUTLYING, _DEGREE = 3.5, 4
 # Error by the next corners, as a share of a square, and their distance, likewise, fitted to drawn boards.
 _LEAK_SADDLE = (0.3, 0.6)
 # Parts of a pixel across an edge of a saddle, and its minimum blur, px, of which the box of a pixel is none.
@@ -664,7 +672,7 @@ class BoardFinder(Finder):
         self.board, self.corners = board, math.prod(board.shape)
         self.nothing = (
             f"no {board} in any of {{count}} images: check its kind and that it is counted in inner corners "
-            "(chessboard) or squares (charuco), columns before rows, and show all of a chessboard"
+            "(chessboard) or squares (charuco), columns before rows, and show each side of a chessboard"
         )
         self._detectors, self._numbers = [], np.empty(0, dtype=np.int64)
         if board.kind == "charuco":
@@ -711,11 +719,42 @@ class BoardFinder(Finder):
 
         image : (height, width) grey values from 0 to 255.
         """
-        guess = self._guess(image.astype(np.uint8))
-        if np.isfinite(guess[:, 0]).sum() < _LEAST_CORNERS:
-            return {}, ()
-        _, steps = self._grid(self.board.places, guess)
-        return {0: _refine_saddles(image, guess, steps, _CROSS if self._detectors else np.inf)}, ()
+        for guess in self._guesses(image.astype(np.uint8)):
+            seen = self.board.places[np.isfinite(guess[:, 0])]
+            if len(seen) < _LEAST_CORNERS or np.linalg.matrix_rank(seen - seen[0]) < 2:
+                continue
+            _, steps = self._grid(self.board.places, guess)
+            corners, light = _refine_saddles(image, guess, steps, _CROSS if self._detectors else np.inf)
+            corners = self._smooth(self.board.places, corners)
+            light *= (-1.0) ** self.board.places.sum(axis=1)
+            contrast = np.median(light[corners.clean]) if corners.clean.any() else 1.0
+            usual = (np.abs(light / contrast - 1.0) < _UNLIKE) | ~corners.clean
+            shows = (usual & np.isfinite(corners.sigma)).reshape(self.board.shape)
+            # OpenCV makes up a side that is covered, and then all numbers are wrong.
+            if self._detectors or min(s.sum() for s in (*shows[[0, -1]], *shows.T[[0, -1]])) > 1:
+                return {0: corners}, ()
+        return {}, ()
+
+    def _smooth(self, places: FloatArray, corners: Corners) -> Corners:
+        """Reject, one by one, corners off the smooth map of the others, as where a cover took an edge.
+
+        The map is a homography, and a polynomial as of a lens. It may err as it does at most corners.
+        """
+        left = np.isfinite(corners.sigma)
+        while left.sum() > 2 * _LEAST_CORNERS:
+            plane = self._grid(places, np.where(left[:, None], corners.pixels, np.nan))[0][left]
+            x, y = ((plane - plane.mean(axis=0)) / np.ptp(plane)).T
+            degree, sigma = min(_DEGREE, math.isqrt(left.sum() // 4)), corners.sigma[left, None]
+            terms = [x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)]
+            basis = np.linalg.qr(np.transpose(terms) / sigma)[0]
+            r = (corners.pixels[left] - plane) / sigma
+            free = np.maximum(1.0 - (basis**2).sum(axis=1), 1e-9)
+            off = np.linalg.norm(r - basis @ (basis.T @ r), axis=1) / np.sqrt(free)
+            if off.max() < _OUTLYING * max(1.0, float(np.median(off))):
+                break
+            left[np.flatnonzero(left)[np.argmax(off)]] = False
+        pixels, sigma = (np.where(left, part.T, np.nan).T for part in corners[:2])
+        return Corners(pixels, sigma, corners.clean & left)
 
     def _grid(self, places: FloatArray, guess: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Corners (N, 2) of a plane grid, and steps (2, N, 2) to the next ones, px, by those seen."""
@@ -737,44 +776,104 @@ class BoardFinder(Finder):
         far = [np.nanmedian(np.linalg.norm(end.pixels - before[0].pixels, axis=1)) for end in ends]
         return {0: ends[int(np.argmin(far))]}
 
-    def _guess(self, grey: ByteArray) -> FloatArray:
-        """Corners (N, 2) as of OpenCV, px, NaN where unseen."""
-        guess = np.full((self.corners, 2), np.nan)
+    def _guesses(self, grey: ByteArray) -> Iterator[FloatArray]:
+        """Corners (N, 2), px, NaN where unseen: as of OpenCV, then those of a chessboard that is covered."""
         if not self._detectors:
-            return self._chessboard(grey)
+            size = self.board.shape[::-1]
+            found, corners = self.cv.findChessboardCornersSB(grey, size, flags=self.cv.CALIB_CB_EXHAUSTIVE)
+            if found:
+                yield self._turned(corners.reshape(*self.board.shape, 2).astype(np.float64), grey)
+            yield self._turned(self._part(grey), grey)
+            return
+        guess = np.full((self.corners, 2), np.nan)
         found = [detector.detectBoard(grey)[:2] for detector in self._detectors]
         corners, numbers = max(found, key=lambda one: 0 if one[1] is None else len(one[1]))
         if numbers is not None:
             guess[np.ravel(numbers)] = np.reshape(corners, (-1, 2))
-        return guess
+        yield guess
 
-    def _chessboard(self, grey: ByteArray) -> FloatArray:
-        """Corners (N, 2) of a chessboard by the first detector that finds it, px, NaN without it.
+    def _turned(self, seen: FloatArray, grey: ByteArray) -> FloatArray:
+        """Corners (N, 2) of a grid (r, c, 2) of a chessboard, px; NaN if it has another shape.
 
         As OpenCV numbers them, the square after the first corner is bright, if a turn of the board makes it.
         """
-        rows, columns = self.board.shape
-        found, corners = self.cv.findChessboardCornersSB(
-            grey, (columns, rows), flags=self.cv.CALIB_CB_EXHAUSTIVE
-        )
-        if not found:  # obliquely seen boards are found by the older detector more often
-            found, corners = self.cv.findChessboardCorners(grey, (columns, rows))
-        if not found:
-            return np.full((rows * columns, 2), np.nan)
-        seen = corners.reshape(rows, columns, 2).astype(np.float64)
         grids = [grid for grid in (np.rot90(seen, k) for k in range(4)) if grid.shape[:2] == self.board.shape]
 
         def lightness(grid: FloatArray) -> float:
             """Sum of grey values of the squares alike the first, less those of the others."""
             middles = 0.25 * (grid[1:, 1:] + grid[1:, :-1] + grid[:-1, 1:] + grid[:-1, :-1])
-            u, v = np.moveaxis(np.rint(middles).astype(np.int64), -1, 0)
-            even = np.indices(u.shape).sum(axis=0) % 2 == 0
-            return float(np.where(even, 1.0, -1.0).ravel() @ grey[v, u].ravel())
+            known = np.isfinite(middles[..., 0])
+            u, v = np.rint(middles[known]).astype(np.int64).T
+            even = np.indices(known.shape).sum(axis=0)[known] % 2 == 0
+            return float(np.where(even, 1.0, -1.0) @ grey[v, u])
 
-        return np.asarray(max(grids, key=lightness).reshape(-1, 2))
+        nothing = np.full((*self.board.shape, 2), np.nan)
+        return np.asarray(max(grids, key=lightness, default=nothing).reshape(-1, 2))
+
+    def _part(self, grey: ByteArray) -> FloatArray:
+        """Grid (r, c, 2) of the corners of a chessboard that is partly covered, px, NaN where covered.
+
+        It grows from a square. Each side of the board must show by two corners: else the numbers are not
+        known, and the grid is empty.
+        """
+        image, most = grey.astype(np.float64), 3 * max(self.board.shape)
+        places = np.indices((most, most))[::-1].reshape(2, -1).T.astype(np.float64)
+        even, seen = (-1.0) ** places.sum(axis=1), np.empty((0, 2))
+        start = np.isin(np.arange(most**2), (most + 1) * (most // 3) + np.array([0, 1, most, most + 1]))
+        for square in self._squares(image):
+            if (np.linalg.norm(seen - square[0], axis=1) < _MIN_SQUARE).any():
+                continue
+            pixels, sigma = np.full((most**2, 2), np.nan), np.full(most**2, np.nan)
+            pixels[start], near, usual, reach = square, start, 0.0, 1
+            known = tried = np.zeros_like(start)
+            while reach <= _GAP and (near is start or known.sum() >= len(square)):
+                guess, steps = self._grid(places, pixels)
+                fitted, light = _refine_saddles(image, np.where(near[:, None], guess, np.nan), steps, np.inf)
+                usual = usual or float(np.median((light * even)[near]))
+                new = fitted.clean & (np.abs(light * even / usual - 1.0) < _UNLIKE)
+                new &= fitted.sigma < _VAGUE * np.linalg.norm(steps, axis=2).min(axis=0)
+                pixels[new], sigma[new] = fitted.pixels[new], fitted.sigma[new]
+                known, reach = known | new, 1 if new.any() else reach + 1
+                tried = tried | near & (known.sum() > 2 * _LEAST_CORNERS)
+                grown = known.reshape(most, most).astype(np.uint8)
+                grown = self.cv.dilate(grown, np.ones((2 * reach + 1, 2 * reach + 1)))
+                near = grown.ravel() > tried | known
+            seen = np.concatenate([seen, pixels[known]])
+            grid = self._smooth(places, Corners(pixels, sigma, known)).pixels.reshape(most, most, 2)
+            for _ in range(2):  # rows, then columns
+                lines = np.flatnonzero(np.isfinite(grid[..., 0]).sum(axis=1) > 1)
+                grid = grid[min(lines, default=0) : max(lines, default=-1) + 1].swapaxes(0, 1)
+            if sorted(grid.shape[:2]) == sorted(self.board.shape):
+                return grid
+        return np.empty((0, 0, 2))
+
+    def _squares(self, image: FloatArray) -> Iterator[FloatArray]:
+        """Corners (4, 2) of squares that may be of a chessboard, px, the clearest first.
+
+        They are saddles of the grey values. The next one is where an edge leads, and has the other sign.
+        """
+        smooth = self.cv.GaussianBlur(image, (0, 0), _SEED_BLUR)
+        xx, xy, yy = (self.cv.Sobel(smooth, -1, *order) for order in ((2, 0), (1, 1), (0, 2)))
+        depth = xy**2 - xx * yy
+        depth[depth < self.cv.dilate(depth, np.ones((5, 5)))] = 0.0
+        v, u = np.unravel_index(np.argsort(-depth, axis=None)[: _SADDLES * self.corners], depth.shape)
+        at, H = np.stack([u, v], axis=1).astype(np.float64), np.array([[xx, xy], [xy, yy]])[..., v, u].T
+        for k, (bends, axes) in enumerate(zip(*np.linalg.eigh(H[:_STARTS]), strict=True)):
+            way, deep = at - at[k], depth[v, u] > _FAINT * depth[v[k], u[k]]
+            other = deep & (axes[:, 1] @ H @ axes[:, 1] < 0.0) & (np.abs(way).max(axis=1) > _MIN_SQUARE)
+            # Along an edge the grey value does not bend.
+            edges = np.sqrt(np.abs(bends[::-1])) * [[1.0, 1.0], [-1.0, 1.0]] @ axes.T
+            along, across = np.abs(edges @ way.T), np.abs(edges[:, ::-1] * [1.0, -1.0] @ way.T)
+            length = np.where(other & (across < _SLOPE * along), along, np.inf)
+            if np.isfinite(length.min(axis=1)).all():
+                a, b = way[length.argmin(axis=1)]
+                a, b = (a, b) if a[0] * b[1] > a[1] * b[0] else (b, a)
+                yield at[k] + [0.0 * a, a, b, a + b]
 
 
-def _refine_saddles(image: FloatArray, guess: FloatArray, steps: FloatArray, cross: float) -> Corners:
+def _refine_saddles(
+    image: FloatArray, guess: FloatArray, steps: FloatArray, cross: float
+) -> tuple[Corners, FloatArray]:
     """Refine corners at which four squares meet: two crossing edges of one blur.
 
     The grey value is b + a (2 Φ(z_1) − 1)(2 Φ(z_2) − 1), z the distance from either edge over the blur. A
@@ -795,8 +894,9 @@ def _refine_saddles(image: FloatArray, guess: FloatArray, steps: FloatArray, cro
     found = Corners(
         guess.copy(), np.where(seen, _UNREFINED_SADDLE, np.nan), np.zeros(len(guess), dtype=np.bool_)
     )
+    contrast = np.full(len(guess), np.nan)
     if not at.size:
-        return found
+        return found, contrast
     half = int(reach[at].max())
     dv, du = np.indices((2 * half + 1, 2 * half + 1)).reshape(2, 1, -1) - half
     rows, columns = (middle[at, k, None].astype(int) + shift for k, shift in ((1, dv), (0, du)))
@@ -833,7 +933,8 @@ def _refine_saddles(image: FloatArray, guess: FloatArray, steps: FloatArray, cro
     good &= np.linalg.norm(x[:, 2:4], axis=1) < _FAR_SADDLE * side[at]
     found.pixels[at] += np.where(good[:, None], x[:, 2:4], np.nan)
     found.sigma[at], found.clean[at] = np.where(good, np.sqrt(variance), np.nan), good
-    return found
+    contrast[at] = x[:, 1]
+    return found, contrast
 
 
 def _saddle_model(

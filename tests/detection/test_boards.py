@@ -61,6 +61,24 @@ def test_a_covered_corner_is_rejected_and_a_small_board_is_less_certain(rng):
     assert np.isfinite(corners.sigma).sum() > 20
 
 
+@pytest.mark.parametrize("covered", [[22], [0, 1, 9, 10, 30], [35, 44], [8, 17, 26, 35, 44, 53]])
+def test_a_chessboard_is_numbered_if_two_corners_on_each_side_show(rng, covered):
+    board = Board.of("chessboard:9x6")
+    image, true = drawn(board, view_of(rng, 36.0), 0.8, 2.0, rng)
+    whole = BoardFinder(board, "4X4_50").find(image.astype(float))[0][0]
+    for k in covered:
+        cv2.circle(image, np.rint(true[k]).astype(int).tolist(), 16, 150, -1)
+    found = BoardFinder(board, "4X4_50").find(image.astype(float))[0]
+    if len(covered) == 6:  # a side: nobody knows how many columns are behind it
+        assert not found
+        return
+    known = np.isfinite(found[0].sigma)
+    assert not known[::-1][covered].any()  # a drawn board ends with the bright square
+    assert known.sum() >= 54 - 2 * len(covered)
+    off = np.linalg.norm(found[0].pixels - whole.pixels, axis=1)[known]
+    assert (off < 5.0 * found[0].sigma[known]).all()
+
+
 @pytest.mark.parametrize("kind", [*KINDS, SPECKLED])
 def test_corners_err_as_they_say_in_images_of_all_kinds(kind):
     found, lost = errors_of_boards("chessboard:9x6", kind, 4)
