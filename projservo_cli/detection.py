@@ -709,9 +709,9 @@ class BoardFinder(Finder):
             return super().absent(paths)
         low, high = self._numbers[[0, -1]]
         return (
-            f"no {self.board} in any of {len(paths)} images: they show tags {min(seen)} to {max(seen)} of "
-            f"the dictionary, and the board has {low} to {high}: give the number of its first tag, as in "
-            f"{self.board._replace(first=min(seen))}"
+            f"no {self.board} in any of {len(paths)} images, but tags {min(seen)} to {max(seen)} of its "
+            f"dictionary, and the board has {low} to {high}: name its first tag, --board "
+            f"{self.board._replace(first=min(seen))} or markers.board.first: {min(seen)}"
         )
 
     def find(self, image: FloatArray) -> tuple[dict[int, Corners], tuple[int, ...]]:
@@ -1063,6 +1063,11 @@ def observe_tags(
                 f"the {cameras[view]} images are mirrored: {count} of {len(pairs)} show tags in the mirror, "
                 "and none as they are: switch mirroring off in the driver, or mirror the files"
             )
+    if not findings.images and findings.ambiguous:
+        raise WorkFailed(
+            f"each tag is more than once in its image, {findings.ambiguous} in all, and rejected: a number "
+            "must be unique: print another one, or cover the tag that is not on the tool"
+        )
     if not findings.images:
         raise WorkFailed(finder.absent([path for _, *views in pairs for path in views]))
     numbers, each = findings.tags, finder.corners if points == "corners" else 1

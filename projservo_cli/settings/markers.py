@@ -63,16 +63,18 @@ class BoardSettings(Section):
     dictionary: _Dictionary | None = Field(
         None, description="of the tags on a ChArUco board by its OpenCV name; null: 4X4_50"
     )
+    first: Whole | None = Field(None, description="number of the first tag on a ChArUco board; null: 0")
 
     @property
     def pattern(self) -> Board:
         """The board as it is detected."""
-        return Board(self.kind, self.rows, self.columns)
+        return Board(self.kind, self.rows, self.columns, self.first or 0)
 
     def contradictions(self) -> Iterator[Finding]:
-        """A dictionary of tags on a board without."""
-        if self.kind == "chessboard" and self.dictionary is not None:
-            yield ("dictionary",), "is of the tags on a board of kind charuco, and a chessboard has none"
+        """Tags of a board without."""
+        for key in ("dictionary", "first"):
+            if self.kind == "chessboard" and getattr(self, key) is not None:
+                yield (key,), "is of the tags on a board of kind charuco, and a chessboard has none"
 
 
 def _tag(number: int, size_m: float, R: Rotation, t: Sequence[float]) -> Tag:

@@ -210,7 +210,8 @@ def test_a_board_whose_tags_begin_at_another_number(projservo, rng, monkeypatch,
     assert np.linalg.norm(table.images[0, 0] - corners[table.marker], axis=1).max() < 0.5
     Path("t.csv").unlink()
     for said, *words in (
-        ("they show tags 20 to 40 of the dictionary, and the board has 0 to 20", "charuco:7x6", "top=a"),
+        ("but tags 20 to 40 of its dictionary, and the board has 0 to 20", "charuco:7x6", "top=a"),
+        ("first tag, --board charuco:7x6:first=20 or markers.board.first: 20", "charuco:7x6", "top=a"),
         ("the top images are mirrored: 1 of 1 show tags in the mirror", str(board), "top=mirror"),
     ):
         answer = projservo(*given[:-1], *words)
@@ -258,6 +259,7 @@ def test_a_configured_board_is_found_in_frames_and_gives_a_length(rng):
     markers = Markers(board=BoardSettings(kind="chessboard", rows=5, columns=7, size_m=0.03))
     assert (len(markers.known), markers.front) == (35, (0, 6, 34, 28))
     assert markers.lengths((0, 6, 34))[0] == pytest.approx([0.0, 0.18, 0.03 * np.hypot(4, 6)])
+    assert str(BoardSettings(kind="charuco", rows=6, columns=7, first=20).pattern) == "charuco:7x6:first=20"
     board = markers.board.pattern
     finder = finder_of(board, None)
     H = view_of(rng, 35.0)
@@ -268,6 +270,7 @@ def test_a_configured_board_is_found_in_frames_and_gives_a_length(rng):
 
 CONTRADICTED = {
     "{kind: chessboard, rows: 7, columns: 9, dictionary: 4X4_50}": "a chessboard has none",
+    "{kind: chessboard, rows: 7, columns: 9, first: 20}": "markers.board.first: is of the tags on a board",
     "{kind: chessboard, rows: 2, columns: 9}": "markers.board.rows: must be at least 3, not 2",
     "{kind: charuco, rows: 7, columns: 9}, tags: roof": "board is set as well, whose corners are the markers",
     "{kind: chessboard, rows: 7, columns: 9}": "a chessboard:9x7 looks the same turned by 180°",

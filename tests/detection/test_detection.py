@@ -211,6 +211,7 @@ REFUSED = {
     "not an image": (["q1,left,right", "1,a1.png,b.txt"], 2, "not an image that OpenCV can read"),
     "another size": (["q1,left,right", "1,a1.png,b1.png", "2,a2.png,big.png"], 2, "81×60 pixels"),
     "no tag": (["q1,left,right", "1,none.png,none.png"], 1, "no tag in any of 2 images"),
+    "twice in each": (["q1,left,right", "1,twice.png,twice.png"], 1, "each tag is more than once in its"),
     "in one view only": (["q1,left,right", "1,a1.png,none.png"], 1, "by both cameras"),
 }
 
@@ -220,10 +221,14 @@ def test_images_that_make_no_table(projservo, name):
     rows, code, message = REFUSED[name]
     put(["l/a1.png", "l/a2.png", "r/b1.png", "r/b2.png", *(["l/c1.png"] if "two" in name else [])])
     put(["r/big.png"], (60, 81))
+    image = np.full((60, 150), 220, dtype=np.uint8)
+    image[10:50, 20:60] = image[10:50, 80:120] = cv2.aruco.generateImageMarker(TAGS, 1, 40)
     for folder in ("l", "r"):
+        write(f"{folder}/twice.png", image)
         write(f"{folder}/none.png", np.full((60, 80), 99, dtype=np.uint8))
     if "left" not in rows[0]:
-        Path("l/none.png").unlink()
+        for other in ("none", "twice"):
+            Path(f"l/{other}.png").unlink()
     Path("r/b.txt").write_text("no image")
     joints(*rows)
     answer = projservo("detect", "l", "r", "--joints-csv", "q.csv", "-o", "t.csv", "-q")
