@@ -79,13 +79,14 @@ def parser_of(study, about, numbers=(), **choices):
     """A parser of the command line of a study.
 
     numbers : name, default and help of each number that is asked for.
-    choices : by name what may be chosen, all by default, or a pair of that and the default.
+    choices : by name what may be chosen, all by default, or a pair of that and the default, a list.
     """
     parser = argparse.ArgumentParser(description=about.splitlines()[0])
     for name, default, counted in numbers:
         parser.add_argument(f"--{name}", type=int, default=default, help=counted)
     for name, choice in choices.items():
-        every, chosen = choice if isinstance(choice, tuple) else (choice, list(choice))
+        pair = isinstance(choice, tuple) and isinstance(choice[-1], list)
+        every, chosen = choice if pair else (choice, list(choice))
         parser.add_argument(f"--{name}", nargs="+", choices=every, default=chosen)
     parser.add_argument("-o", "--output", type=Path, default=Path(f"{study}.csv"), help="every row, as CSV")
     return parser

@@ -5,6 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.studies.common import parser_of
+
 STUDIES = sorted(
     path.stem
     for path in Path(__file__).parent.glob("*.py")
@@ -16,6 +18,13 @@ STUDIES = sorted(
 def test_a_study_can_be_run(name):
     pytest.importorskip("cv2")
     assert callable(import_module(f"tests.studies.{name}").main)
+
+
+@pytest.mark.parametrize("arms", [("ur5", "hobby"), ["ur5", "hobby"], {"ur5": 1, "hobby": 2}], ids=type)
+def test_a_study_takes_all_choices_by_default_and_each_by_name(arms):
+    parser = parser_of("study", "Title.", arms=arms)
+    assert parser.parse_args([]).arms == ["ur5", "hobby"]
+    assert parser.parse_args(["--arms", "hobby"]).arms == ["hobby"]
 
 
 def test_images_do_not_tell_a_base_that_steps_from_cameras_that_step_alike():
