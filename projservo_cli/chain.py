@@ -19,6 +19,7 @@ from projservo_cli.config.inputs import (
     servo_inputs,
     suggestion_inputs,
 )
+from projservo_cli.findings import Finding
 from projservo_cli.geometry.jit import CACHE_FOLDER
 from projservo_cli.laws import CODES, POINT_LAWS, codes_of, law_and_mode, must_converge, run_name
 from projservo_cli.outdated import STAGES, Step, inputs_of, key_of_calibration, result_of, steps_for
@@ -63,6 +64,7 @@ class Chain:
     laws: tuple[str, ...] = field(init=False)  # names of the runs of laws that the steps make or need
     failed: str = ""  # name of the step that failed
     reason: str = ""  # why
+    evidence: tuple[Finding, ...] = ()  # likewise, as data
     laws_done: tuple[str, ...] = ()
 
     def __post_init__(self, wanted: Sequence[str], force: bool) -> None:
@@ -157,7 +159,7 @@ class Chain:
             with self._compiling(), self._connection():
                 self._make_steps(steps)
         except WorkFailed as error:  # of a robot that may not be at rest
-            self._fail(steps[-1], " ".join(str(error).split()))
+            self._fail(steps[-1], error)
         if self.failed:
             return
         text = stored_yaml(self.config)
@@ -228,10 +230,11 @@ class Chain:
         carrier: CarryingObject | None = record.carrier
         return carrier
 
-    def _fail(self, step: Step, reason: str) -> None:
+    def _fail(self, step: Step, why: str | WorkFailed) -> None:
         """Note the failure of a step, of a sequence with what stays as it was sent."""
         after = self._left_behind(step) if step.part and step.stage == "servo" else ""
-        self.failed, self.reason = step.name, reason + after
+        self.failed, self.reason = step.name, " ".join(str(why).split()) + after
+        self.evidence = why.findings if isinstance(why, WorkFailed) else ()
 
     def _left_behind(self, step: Step) -> str:
         """Say what stays as it was sent, and which steps of the sequence were not begun."""
@@ -366,7 +369,7 @@ class Chain:
         try:
             result = result_of(step, self.config, *self._made(step, run))
         except WorkFailed as error:
-            self._fail(step, " ".join(str(error).split()))
+            self._fail(step, error)
             if error.refutes:
                 self._keep(replace(self.run, refuted=self.reason))
             return

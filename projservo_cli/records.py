@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from projservo_cli.findings import DEVIATIONS, Finding
 from projservo_cli.passwords import masked
 
 FloatArray = npt.NDArray[np.float64]
@@ -122,11 +123,12 @@ class WorkFailed(RuntimeError):  # noqa: N818 - a verdict, not a programming err
     """The data were read, but the work they ask for cannot be done (exit code 1).
 
     refutes : whether images or readings of a robot contradict its calibration, and so the recording of it.
+    findings : the evidence as data.
     """
 
-    def __init__(self, *args: object, refutes: bool = False) -> None:
+    def __init__(self, *args: object, refutes: bool = False, findings: Iterable[Finding] = ()) -> None:
         super().__init__(*masked(args))
-        self.refutes = refutes
+        self.refutes, self.findings = refutes, tuple(findings)
 
 
 def board_numberings(rows: int, columns: int) -> IntArray:
@@ -242,40 +244,6 @@ class Errors(NamedTuple):
         markers = apart(self.marker, self.own, np.arange(m)[:, None], m)
         shared = np.pad(self.shared, ((0, 0), (0, 3 * m)))
         return np.concatenate([shared, markers.reshape(-1, shared.shape[1])])
-
-
-class ModelError(NamedTuple):
-    """Deviation of an arm or a rig from the model, by the residuals of a calibration."""
-
-    kind: str  # scale, quadratic, cubic, harmonic, coupling, sag, joint_drift, joint_step, camera_drift, …
-    joints: tuple[int, ...]  # numbers of the joints, from 1; of a coupling the moved one last
-    view: str  # name of the view, empty for both
-    # of scale and coupling a share, of other readings rad (prismatic × 0.3 m/rad), of others rms px in images
-    estimate: float
-    deviation: float  # standard deviation of the estimate
-    effect_px: float  # rms error of predictions within the joint ranges, per marker and view
-    first: int | None  # number of the pose from which it holds, of a step
-    others: tuple[str, ...] = ()  # codes of those that explain the images about as well
-
-    @property
-    def code(self) -> str:
-        """Kind, joints and view in one word, and those of the others."""
-        return "/".join([f"{self.kind}|{','.join(map(str, self.joints))}|{self.view}", *self.others])
-
-    @property
-    def numbers(self) -> tuple[float, float, float, float]:
-        """Estimate, deviation, effect and first pose, NaN if it holds in all."""
-        return self.estimate, self.deviation, self.effect_px, math.nan if self.first is None else self.first
-
-    @classmethod
-    def of(cls, code: str, numbers: Iterable[float]) -> "ModelError":
-        """Read it back from ``code`` and ``numbers``."""
-        own, *others = code.split("/")
-        kind, joints, view = own.split("|")
-        estimate, deviation, effect, first = map(float, numbers)
-        which = tuple(int(joint) for joint in joints.split(",") if joint)
-        begin = None if math.isnan(first) else int(first)
-        return cls(kind, which, view, estimate, deviation, effect, begin, tuple(others))
 
 
 def apart(common: FloatArray, own: FloatArray, marker: IntArray, m: int) -> FloatArray:
@@ -507,15 +475,6 @@ class Rejections:
         "undecided_pair pair_end", about="pairs of joints, from 1, whose order no pose shows"
     )
 
-    @property
-    def order_advice(self) -> str:
-        """Advice about joints whose order nothing shows; empty if there are none, or it was not tested."""
-        if self.undecided_order is None or not self.undecided_order.size:
-            return ""
-        *joints, last = np.unique(self.undecided_order).tolist()
-        names = f"the order of joints {', '.join(map(str, joints))} and {last}"
-        return f"{names} is taken from the table; no pose shows it: add poses in which several move"
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class StatedErrors:
@@ -551,19 +510,6 @@ class StatedErrors:
         "model_error_column", about="its usual or smallest detectable size, 0, and its effect in px"
     )
 
-    @property
-    def model_errors(self) -> tuple[ModelError, ...]:
-        """Deviations from the model that limit predictions, the largest effect first."""
-        rows = [] if self.model_error_numbers is None else self.model_error_numbers.tolist()
-        return tuple(map(ModelError.of, self.model_error, rows))
-
-    @property
-    def unshown(self) -> ModelError | None:
-        """The deviation that these data do not show and that would spoil predictions most."""
-        if not self.unshown_error or self.unshown_numbers is None:
-            return None
-        return ModelError.of(self.unshown_error[0], self.unshown_numbers.tolist())
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Calibration(StatedErrors, Rejections, FitQuality, ProjectiveKinematics):
@@ -579,6 +525,10 @@ class Calibration(StatedErrors, Rejections, FitQuality, ProjectiveKinematics):
     advice: tuple[str, ...] = _scalar(about="remedies, one sentence each")
     limit: str = _scalar(about="factor that limits the predictions", default="")
     notes: tuple[str, ...] = _scalar(about="those of the remedies that mend nothing but noise", default=())
+    findings: tuple[Finding, ...] = _scalar(
+        about="what is off: code, severity, subject, amount, deviation, limit, unit, effect",
+        default=(),
+    )
     seconds: float = _scalar("s", "computing time")
     time_offset_s: FloatArray | None = _optional_array(
         "view", "s", "time of a joint reading less the time of its image"
@@ -598,6 +548,16 @@ class Calibration(StatedErrors, Rejections, FitQuality, ProjectiveKinematics):
         about="of each the number of poses, and the error of its images within the joint ranges now and "
         "before it moved, rms px",
     )
+
+    @property
+    def model_errors(self) -> tuple[Finding, ...]:
+        """Deviations from the model that limit predictions, in the order of ``model_error_bias``."""
+        return tuple(one for one in self.findings if one.code in DEVIATIONS)
+
+    @property
+    def unshown(self) -> Finding | None:
+        """The deviation that these data do not show and that would spoil predictions most."""
+        return next((one.others[0] for one in self.findings if one.code == "unshown"), None)
 
     def without_covariance(self) -> "Calibration":
         """The same, which takes little memory, for those who do not ask how far it is off."""

@@ -15,8 +15,10 @@ from projservo_cli import records
 from projservo_cli.cli import main
 from projservo_cli.cli.equations import REGISTER
 from projservo_cli.config.schema import json_schema, sweep_schema
+from projservo_cli.findings import DEVIATIONS, LIMITS, NOTE, Finding, Subject
 from projservo_cli.loop import verdicts as loop_verdicts
 from projservo_cli.sweeps.runs import ALL_VERDICTS, BETWEEN, NUMBERED, measured_columns
+from projservo_cli.words import ROWS, Setup, line, sentence
 
 # Where a run file holds which record.
 GROUPS = {
@@ -129,6 +131,39 @@ def verdicts() -> Iterator[str]:
     yield from python.markdown(inspect.cleandoc(loop_verdicts.__doc__ or "").split("\n\n", 1)[1])
 
 
+def example(code: str) -> Finding:
+    """A finding of a code with values for all that its words may name."""
+    texts, counted = "".join(ROWS[code]), ("{count}", "{total}", "{times}")
+    of_joints = ("joint", "quadratic", "cubic", "harmonic", "sag", "little", "circular", "turned")
+    unit, amount, limit, deviation = "px", 0.6, 0.2, 0.1
+    if any(name in texts for name in counted):
+        unit, amount, limit = "1", 12.0, 400.0
+    elif code in ("scale", "coupling") or "{percent}" in texts:
+        unit, amount, deviation = "1", 0.02, 0.001
+    elif any(word in code for word in of_joints):
+        unit, amount, deviation, limit = "rad", 0.0349, 0.00175, 0.2
+    names = {"unused_start": "arm.json", "rejected_poses": "first", "placeholders": "u = 9999"}
+    names |= {"other_mount": "tool", "joint_type": "RPR", "whole_seconds": "t_q"}
+    joints = (2, 3) if code in ("coupling", "undecided_order") else (2,)
+    subject = Subject(joints, ("left", "right"), (5, 6), None, (7, 9), names.get(code, "views"))
+    of_part = Subject(views=("left",)) if code == "turned_board" else Subject(markers=(5,))
+    others = (Finding("noise", NOTE, of_part, 9.0, limit=12.0, unit="1"),) * 2
+    if code == "unshown":
+        others = (Finding("sag", subject=Subject(joints=(3,)), amount=0.01, unit="rad"),)
+    return Finding(code, LIMITS, subject, amount, deviation, limit, unit, 1.5, others)
+
+
+def findings() -> Iterator[str]:
+    """All findings by their codes, each with an example and its remedy."""
+    rows = []
+    for code in (code for code in ROWS if code != "told"):
+        one, setup = example(code), Setup()
+        one = dataclasses.replace(one, others=()) if code in DEVIATIONS else one
+        said, whole = sentence(one, setup), line(one, setup)
+        rows.append((f"`{code}`", text(said), text(whole.removeprefix(said).lstrip(";: "))))
+    yield from table(("code", "as in", "remedy"), rows)
+
+
 WRITERS: dict[str, Callable[[], Iterator[str]]] = {
     "configuration-keys": lambda: keys.all_keys(json_schema()),
     "sweep-keys": lambda: keys.all_keys(sweep_schema()),
@@ -137,6 +172,7 @@ WRITERS: dict[str, Callable[[], Iterator[str]]] = {
     "commands": commands,
     "equations": equations,
     "verdicts": verdicts,
+    "findings": findings,
     "python-interface": python.python_interface,
     "robot-contract": python.robot_contract,
     "law-contract": python.law_contract,

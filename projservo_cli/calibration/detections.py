@@ -6,6 +6,7 @@ once, so that each keeps its own loop: two-view geometry, rigid motions, axis po
 """
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import combinations
@@ -15,6 +16,7 @@ from typing import Any
 import numpy as np
 from scipy.special import chdtri
 
+from projservo_cli.findings import LIMITS, Finding, Subject
 from projservo_cli.records import (
     TOOL,
     VIEWS,
@@ -27,6 +29,7 @@ from projservo_cli.records import (
     WorkFailed,
     prismatic_of,
 )
+from projservo_cli.words import Setup, quantity
 
 # Difference, rad or m, below which two joint readings are equal: far below any encoder's resolution.
 _SAME_READING = 1e-7
@@ -42,6 +45,8 @@ REACH_RAD = 0.5
 REACH_M = 0.15
 # Maximum trial motion to advise, in reaches.
 MAX_REACHES = 4.0
+# Codes of joints that no motion determines, that moved with others alone, seldom, or too little.
+_WEAK = ("hopeless_joint", "joint_together", "joint_in_few_poses", "little_motion")
 # Minimum image motion over the range of a joint, in units of the pixel noise.
 MIN_MOTION = 5.0
 # Range of a joint without image motion, in reaches, above which it did not follow its readings.
@@ -150,6 +155,16 @@ class Detections:
         """Numbers (n,) of the joints along the arm, from 1."""
         numbers = np.arange(1, self.prismatic.size + 1)
         return numbers[::-1] if self.mount == TOOL else numbers
+
+    @property
+    def units(self) -> list[str]:
+        """Unit of each joint (n,), rad or m."""
+        return ["m" if slides else "rad" for slides in self.prismatic]
+
+    @property
+    def setup(self) -> Setup:
+        """Arm and cameras, for words."""
+        return Setup(self.mount, self.view, self.prismatic.size)
 
     @property
     def both(self) -> BoolArray:
@@ -334,87 +349,49 @@ def require_no_copies(detections: Detections) -> None:
             )
 
 
-def describe_joints(
-    which: IntArray,
-    span: FloatArray,
-    prismatic: BoolArray,
-    needed: FloatArray,
-    numbers: IntArray,
-    alone: FloatArray | None = None,
-) -> tuple[str, ...]:
-    """Advice for joints that moved too little, or never apart from the others, one line for all alike.
+def weak_joints(
+    which: IntArray, span: FloatArray, needed: FloatArray, detections: Detections, alone: FloatArray
+) -> list[Finding]:
+    """Find out why joints are hardly determined: those without a remedy, moved together, seldom, or little.
 
     which : (k,) indices of these joints.
     span : (n,) range of each joint in the data, rad or m.
     needed : (n,) range of a trial motion that would determine it, rad or m; NaN if none would.
-    numbers : (n,) of the joints along the arm.
-    alone : (n,) range over which it moved alone, rad or m, if known.
+    alone : (n,) range over which it moved alone, rad or m.
     """
-    single = len(span) == 1
-    reach = np.where(prismatic, REACH_M, REACH_RAD)
-    hopeless = ~(needed <= MAX_REACHES * reach)
-    apart, enough = ~hopeless & (span >= reach) & (not single), ~hopeless & (needed <= span)
-    if alone is not None:  # such a joint needs more poses of the same kind
-        apart &= ~(needed <= alone)
-    rest, lines = np.isin(np.arange(len(span)), which), []
-    elsewhere = "markers farther from its axis" if single else "trials of every joint"
-    by_itself = "" if single else " in which {it} moves alone"
-    only = "" if single else " alone"
-    for alike, text in (
-        (hopeless, f"{{joints}} moved {{moved}}; no motion of {{it}}{only} would do: record {elsewhere}"),
-        (
-            apart,
-            "{joints} moved {moved} but hardly apart from the other joints: move {it} alone, by {needed} or "
-            "more",
-        ),
-        (
-            enough,
-            f"{{joints}} moved {{moved}}, in too few poses: record further ones{by_itself}, by {{needed}} "
-            "or more",
-        ),
-        (np.ones_like(rest), "{joints} moved only {moved}: move {it} at least {needed}"),
-    ):
-        rows = np.flatnonzero(rest & alike)
-        rest[rows] = False
-        if rows.size:
-            moved, required = (
-                _join_words([format_motion(values[i], bool(prismatic[i])) for i in rows])
-                for values in (span, needed)
-            )
-            joints = f"joint{'s' * (rows.size > 1)} {_join_words([str(i) for i in numbers[rows]])}"
-            it = "it" if rows.size == 1 else "each"
-            lines.append(text.format(joints=joints, moved=moved, needed=required, it=it))
-    return tuple(lines)
+    reach = np.where(detections.prismatic, REACH_M, REACH_RAD)
+    found = list[tuple[int, Finding]]()
+    for i in which.tolist():
+        if not needed[i] <= MAX_REACHES * reach[i]:
+            order = 0
+        elif span[i] >= reach[i] and len(span) > 1 and not needed[i] <= alone[i]:
+            order = 1
+        else:
+            order = 2 if needed[i] <= span[i] else 3
+        limit = "amplitude" if span[i] < reach[i] else "geometry"
+        subject = Subject(joints=(int(detections.numbers[i]),), name=limit)
+        most = math.nan if order == 0 else float(needed[i])
+        finding = Finding(_WEAK[order], LIMITS, subject, float(span[i]), limit=most, unit=detections.units[i])
+        found.append((order, finding))
+    return [finding for _, finding in sorted(found, key=lambda one: one[0])]
 
 
-def _join_words(words: list[str]) -> str:
-    """Join words by commas, the last by "and"."""
-    return " and ".join(filter(None, (", ".join(words[:-1]), words[-1])))
-
-
-def require_moved(number: int, span: float, prismatic: bool, motion_px: float, sigma_px: float) -> None:
+def require_moved(number: int, span: float, unit: str, motion_px: float, sigma_px: float) -> None:
     """Refuse a joint if its range moves the images by no more than noise: too short, or it did not follow."""
     if motion_px >= MIN_MOTION * sigma_px:
         return
     seen = (
         f"the images by {motion_px:.3g} px, less than {MIN_MOTION:g} times their noise of {sigma_px:.3g} px"
     )
-    reach = REACH_M if prismatic else REACH_RAD
+    reach = REACH_M if unit == "m" else REACH_RAD
     if span < _STANDING * reach:
-        advice = (
-            f"joint {number} moved only {format_motion(span, prismatic)}: move it at least "
-            f"{format_motion(0.5 * reach, prismatic)}"
-        )
+        needed = quantity(0.5 * reach, unit)
+        advice = f"joint {number} moved only {quantity(span, unit)}: move it at least {needed}"
         raise WorkFailed(f"too little excitation: the range of joint {number} moves {seen}; {advice}")
     raise WorkFailed(
-        f"joint {number} stands still: its readings range over {format_motion(span, prismatic)} but "
+        f"joint {number} stands still: its readings range over {quantity(span, unit)} but "
         f"move {seen}; check that it moved and that its readings are its own, or move a marker off its axis"
     )
-
-
-def format_motion(value: float, prismatic: bool) -> str:
-    """Format a joint motion in mm or degrees."""
-    return f"{1e3 * value:.3g} mm" if prismatic else f"{np.degrees(value):.3g}°"
 
 
 def require_size_and_noise(image_size: Any, sigma_px: Any) -> None:
@@ -500,7 +477,7 @@ def _require_moving(detections: Detections, sigma: float) -> None:
         square = 12.0 * _variances(*_tracks(detections.of_poses(poses))).sum(axis=1)
         path = np.sqrt(max(float(square.mean()) - 24.0 * sigma**2, 0.0)) if square.size else np.inf
         span = float(np.ptp(detections.q[poses, i]))
-        require_moved(int(detections.numbers[i]), span, bool(detections.prismatic[i]), path, sigma)
+        require_moved(int(detections.numbers[i]), span, detections.units[i], path, sigma)
 
 
 def _require_all_moving(detections: Detections) -> None:

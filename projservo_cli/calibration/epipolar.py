@@ -72,8 +72,8 @@ class ImageGeometry(ABC):
     core: "Core"  # the same noise, robust against many wrong correspondences, and its interval
     min_px: float  # noise below which images are exact
 
-    origin: ClassVar[str]  # of the noise, for messages
-    shown: ClassVar[str]  # who shows it, likewise
+    origin: ClassVar[str]  # of the noise: views, or body
+    shown: ClassVar[str]  # who shows it, for messages
 
     @property
     def noise_px(self) -> float:
@@ -108,7 +108,7 @@ class Epipolar(ImageGeometry):
     inlier: BoolArray  # (N,) whether a correspondence used agrees with F
     parallax_px: float  # median distance of the second view from a homography of the first
 
-    origin, shown = "that the epipolar geometry shows", "both views show"
+    origin, shown = "views", "both views show"
 
     @classmethod
     def of(cls, detections: Detections, rng: np.random.Generator) -> "Epipolar":

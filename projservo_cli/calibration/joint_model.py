@@ -15,7 +15,7 @@ import numpy as np
 
 from projservo_cli.calibration.bundle_adjustment import LeastSquares
 from projservo_cli.calibration.checks.model_error import suspected
-from projservo_cli.calibration.detections import MAX_JUDGED, format_motion, per_rad
+from projservo_cli.calibration.detections import MAX_JUDGED, per_rad
 from projservo_cli.calibration.epipolar import ImageGeometry
 from projservo_cli.calibration.robust_fit import Solution, fit_from, left_out_errors, left_out_px
 from projservo_cli.geometry.joint_curve import basis, slopes, torques
@@ -29,6 +29,7 @@ from projservo_cli.records import (
     JointCurve,
     WorkFailed,
 )
+from projservo_cli.words import quantity
 
 # Functions of each kind; those of a coupling read another joint.
 _FUNCTIONS = {
@@ -309,7 +310,7 @@ class _Search:
         name = next(one.words for one, keys in _terms(chosen, found).items() if key in keys)
         i = joint[t]
         a_rad, slides = per_rad(params.prismatic)[i], bool(params.prismatic[i])
-        amount, most_allowed = (format_motion(x * a_rad, slides) for x in (off[t], _OPEN))
+        amount, most_allowed = (quantity(x * a_rad, "m" if slides else "rad") for x in (off[t], _OPEN))
         raise WorkFailed(
             f"joint model {name}: the data do not determine it, joint {problem.detections.numbers[i]} may be "
             f"off by {amount}, more than {most_allowed} within its range: leave it out, or record more poses "

@@ -2,7 +2,7 @@
 
 import dataclasses
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any
 
@@ -16,7 +16,7 @@ from projservo_cli.calibration.checks.model_error import ModelCheck
 from projservo_cli.calibration.checks.numbering import checked_geometry
 from projservo_cli.calibration.checks.outliers import (
     Outliers,
-    describe_moved,
+    moved_images,
     outlier_rows,
     rejection_reasons,
 )
@@ -25,12 +25,12 @@ from projservo_cli.calibration.checks.refusal import (
     DOUBTED_RATIO,
     MUCH,
     contradiction,
-    describe_deviation,
-    describe_other_motion,
-    describe_unexplained,
+    deviation,
     joint_at_fault,
+    other_motion,
     refusal,
     straight_joints,
+    unexplained,
 )
 from projservo_cli.calibration.detections import (
     Detections,
@@ -46,7 +46,6 @@ from projservo_cli.calibration.lens_estimation import fit_lens, share_explained,
 from projservo_cli.calibration.prediction import LENS, along_the_arm
 from projservo_cli.calibration.projective import Projective, closed_form_operators
 from projservo_cli.calibration.robust_fit import (
-    CHECK_READINGS,
     MAX_PREDICTED,
     REFUSE_RATIO,
     Expected,
@@ -57,6 +56,7 @@ from projservo_cli.calibration.robust_fit import (
 )
 from projservo_cli.calibration.time_offset import with_time_offset
 from projservo_cli.calibration.views import with_all_views, with_best_pair, with_own_noise
+from projservo_cli.findings import LIMITS, REFUSES, Finding, Subject
 from projservo_cli.geometry.lens import K1
 from projservo_cli.image_size import ImageSize, border_distance, image_sizes
 from projservo_cli.records import (
@@ -71,6 +71,7 @@ from projservo_cli.records import (
     Observation,
     letters_of,
 )
+from projservo_cli.words import judged, with_findings
 
 _METHODS = ("bundle_adjustment", "closed_form")
 # Fitted over expected noise above which a fit that passes may still have one joint at fault.
@@ -93,10 +94,6 @@ _LENS_STRAYS = 0.01
 _BEYOND_PX = 1.0
 # Noise of a camera over that of the quietest one from which it is named.
 _NOISY = 2.0
-# Maximum number of lines of advice.
-_MAX_ADVICE = 5
-# Maximum number of markers that a message names.
-_EXAMPLES = 3
 
 
 def calibrate(
@@ -283,28 +280,27 @@ def _maximum_likelihood(
         result = _refined(solution, epipolar, expected, frame, limit_px)
     except Misfit as refused:
         # The joints of a simulation are as configured, so none is at fault.
-        cause = "" if expected.known else joint_at_fault(start, REFUSE_RATIO * expected.sigma_px)
-        if not cause:
+        cause = None if expected.known else joint_at_fault(start, REFUSE_RATIO * expected.sigma_px)
+        if cause is None:
             raise
-        raise Misfit(f"{cause}; as given, {refused}") from None
+        raise Misfit.by([cause, *refused.findings], whole) from None
     if not expected.known and (straight := straight_joints(solution)):
         seen = undistorted(search.problem.detections, solution.params.lens).of_pair()
         there = LeastSquares.of(seen, start.problem.q_reference)
         start = dataclasses.replace(start, problem=there, epipolar=epipolar)
         if cause := joint_at_fault(start, _AS_GOOD * solution.sigma_px, straight):
-            raise Misfit(f"{cause}; as given, residuals of {solution.sigma_px:.3g} px show no turn of it")
-    cause = ""
+            no_turn = Finding("no_turn", REFUSES, cause.subject, solution.sigma_px, unit="px")
+            raise Misfit.by([cause, no_turn], whole)
+    cause = None
     if not expected.known and expected.ratio(solution) > _DOUBTFUL_RATIO:
         cause = joint_at_fault(start, _DOUBTFUL_SHARE * solution.sigma_px)
+    ahead = [] if cause is None else [dataclasses.replace(cause, severity=LIMITS)]
     if epipolar.sigma_px < expected.min_px:
-        note = (
-            f"the images have no noise ({epipolar.sigma_px:.2g} px): they were made from poses, whose errors "
-            "no two markers show apart; give the noise of these (--noise-px)"
-        )
-    advice = tuple(filter(None, (cause, *result.advice[:1], _worst_view(result), *result.advice[1:], note)))
+        ahead.append(Finding("exact_images", LIMITS, amount=epipolar.sigma_px, unit="px"))
+    result = with_findings(result, filter(None, [_worst_view(result), note]), ahead)
     if curved is not None and result.joint_curve is not None:
         result = dataclasses.replace(result, joint_curve=np.hstack([result.joint_curve[:, :5], curved.gains]))
-    return solution, expected, dataclasses.replace(result, advice=advice[:_MAX_ADVICE])
+    return solution, expected, result
 
 
 def _refined(
@@ -313,17 +309,21 @@ def _refined(
     """Record of the maximum-likelihood solution in its projective frame, with its covariance."""
     share = share_explained(whole, frame)
     solution, kept = whole.determined()
+    whole_seen = whole.problem.detections
+    of_lens = Finding("unmodelled_lens", LIMITS, amount=share, unit="1")
     try:
         if (why := refusal(solution, expected)) is not None:
-            raise Misfit(why)
+            raise Misfit.by([why], whole_seen)
         found = Outliers.of(solution)
-        doubt = describe_unexplained(solution, found, epipolar)
+        doubt = unexplained(solution, found, epipolar)
         kept_by = np.sum([solution.used | found.explained, solution.used], axis=(1, 2))
         out, gone = 1.0 - kept_by / whole.problem.detections.seen.sum()
-        much = bool(doubt) or out > MUCH or gone > _MAX_REJECTED
-        suspicion = "lens" if share else "joint readings"
-        if much and not share and solution.sigma_px > DOUBTED_RATIO * epipolar.noise_px:  # not the joints
-            suspicion = "outliers"
+        much = doubt is not None or out > MUCH or gone > _MAX_REJECTED
+        suspicion = Finding("lagging_joints", LIMITS)
+        if share:
+            suspicion = of_lens
+        elif much and solution.sigma_px > DOUBTED_RATIO * epipolar.noise_px:  # not the joints
+            suspicion = Finding("outliers", LIMITS)
         require_poses(solution.kept().problem.detections)
         errors = solution.errors()
         record = _record(
@@ -332,51 +332,41 @@ def _refined(
         if much:
             why = contradiction(whole, solution, found, epipolar, record.predicted_rms_px or 0.0)
             if why or (doubt and share >= _DECISIVE_SHARE):
-                summary = f"{100.0 * gone:.0f} % of the detections do not fit it, and {why}"
-                summary = describe_other_motion(solution, found, epipolar) or doubt or summary
-                raise Misfit(f"the fit does not describe the data: {summary}")
+                raise Misfit.by(
+                    filter(None, [other_motion(solution, found, epipolar) or doubt or why]), whole_seen
+                )
     except Misfit as refused:
-        if share >= _DECISIVE_SHARE:
-            hint = f"lens distortion would explain {100.0 * share:.0f} % of their squares: try --lens"
-        elif not (hint := describe_deviation(solution, expected)):
+        hint = deviation(solution, expected) if share < _DECISIVE_SHARE else of_lens
+        if hint is None:
             raise
-        raise Misfit(f"{str(refused).removesuffix(CHECK_READINGS)}; {hint}") from None
-    lens = _lens_advice(record, share, frame.known)
-    advice = (*lens, *record.advice) if share else (*record.advice, *lens)
+        raise Misfit.by([*refused.findings, hint], whole_seen) from None
+    more = [*_of_lens(record, frame.known)]
     if kept.all():
-        return dataclasses.replace(record, advice=advice)
+        return with_findings(record, more)
     detections = whole.problem.detections
-    names = ", ".join(map(str, detections.marker[~kept][:_EXAMPLES]))
-    more = f" and {few} more" if (few := np.count_nonzero(~kept) - _EXAMPLES) > 0 else ""
-    seldom = f"hardly any detection of marker {names}{more} fits: rejected; record it in more poses"
+    more.append(Finding("seldom_fitting", LIMITS, Subject(markers=tuple(detections.marker[~kept].tolist()))))
     outlier = np.concatenate(
         [record.outlier, outlier_rows(detections, detections.seen & ~kept[detections.marker_of])]
     )
     outlier = outlier[np.lexsort(outlier.T[::-1])]
     lost = rejection_reasons(whole, kept)
     lost[:, 0] = detections.marker[lost[:, 0]]
-    return dataclasses.replace(record, outlier=outlier, rejected_markers=lost, advice=(*advice, seldom))
+    return with_findings(dataclasses.replace(record, outlier=outlier, rejected_markers=lost), more)
 
 
-def _lens_advice(calibration: Calibration, share: float, centered: bool) -> tuple[str, ...]:
-    """Advice about the lens, by the share of residuals it would explain, else by its uncertainty."""
+def _of_lens(calibration: Calibration, centered: bool) -> Iterator[Finding]:
+    """Findings on an estimated lens: that there is none, or that its centre is not known."""
     if calibration.lens is None:
-        if share == 0.0:
-            return ()
-        return (f"lens distortion would explain {100.0 * share:.0f} % of the squared residuals: try --lens",)
+        return
     k, terms = calibration.lens[:, K1:].ravel(), calibration.lens_terms
     first = calibration.P.size + calibration.H_hat_0.size
     of_lenses = calibration.sqrt_cov_shared[first : first + len(calibration.lens) * terms]
     of_lenses = of_lenses.reshape(-1, terms, of_lenses.shape[-1])[:, :LENS].reshape(k.size, -1)
     statistic = k @ np.linalg.solve(of_lenses @ of_lenses.T, k)
     if statistic < chdtri(k.size, _NO_LENS_TAIL):
-        return ("the images show no lens distortion: omit --lens",)
-    if terms == LENS and not centered:
-        return (
-            "the lens distortion is centred on the region where markers were seen: give --image-size to "
-            "centre it on the image",
-        )
-    return ()
+        yield Finding("no_lens")
+    elif terms == LENS and not centered:
+        yield Finding("lens_off_center", LIMITS)
 
 
 def _closed_form(detections: Detections, epipolar: Epipolar, expected: Expected) -> Calibration:
@@ -387,7 +377,7 @@ def _closed_form(detections: Detections, epipolar: Epipolar, expected: Expected)
     dof = 2 * int(np.count_nonzero(seen)) - problem.size
     solution = Solution(problem, result.params, problem.residual(result.params), seen, dof)
     found = Outliers.empty(problem.detections)
-    return _record(result, solution, expected, None, found, "lens or joint readings")
+    return _record(result, solution, expected, None, found, Finding("lagging_joints", LIMITS))
 
 
 def _record(
@@ -396,7 +386,7 @@ def _record(
     expected: Expected,
     errors: Errors | None,
     found: Outliers,
-    suspicion: str,
+    suspicion: Finding,
     *,
     limit_px: float = np.inf,
 ) -> Calibration:
@@ -412,9 +402,9 @@ def _record(
     problem, detections, params = solution.problem, solution.problem.detections, result.params
     outlier = outlier_rows(detections, detections.seen & ~solution.used & ~found.explained)
     counts = len(found.suspect) + len(found.poses), len(found.id_switches)
-    moved = describe_moved(detections, found.moved)
     verdict = assess(solution, errors, expected, outlier, counts, suspicion, limit_px)
-    check = verdict.check
+    check, (about, *rest) = verdict.check, verdict.findings
+    findings = (about, *rest, *moved_images(detections, found.moved))
     if errors is None:
         m, unknown = len(params.M), np.full(params.P.size + params.H_hat.size, np.nan)
         off = Errors(unknown[:, None], np.full((m, 4, 1), np.nan), np.full((m, 4, 3), np.nan))
@@ -435,13 +425,7 @@ def _record(
         view=detections.view,
         mount=detections.mount,
         joint_types=letters_of(detections.prismatic),
-        usable=verdict.usable,
-        reason=verdict.reason,
-        limit=verdict.limit,
-        notes=verdict.notes,
-        advice=(f"{moved}: images that disagree are rejected; fix the cameras", *verdict.advice)
-        if moved
-        else verdict.advice,
+        **judged(findings, detections.setup),
         rms_px=solution.rms_px,
         sigma_px=expected.sigma_px,
         corner_squares=corner_squares,
@@ -492,15 +476,14 @@ def _record(
     )
 
 
-def _worst_view(calibration: Calibration) -> str:
-    """Advice about a camera that is much noisier than another; empty if there is none."""
+def _worst_view(calibration: Calibration) -> Finding | None:
+    """Find a camera that is much noisier than another."""
     noise = calibration.sigma_view_px
     if noise is None or noise.max() <= _NOISY * noise.min():
-        return ""
-    worst, best = (calibration.view[int(v)] for v in (np.argmax(noise), np.argmin(noise)))
-    return (
-        f"the {worst} camera is {noise.max() / noise.min():.2g} times as noisy as the {best} one "
-        f"({noise.max():.2g} and {noise.min():.2g} px), and counts less: check its focus, light and mount"
+        return None
+    views = tuple(calibration.view[int(v)] for v in (np.argmax(noise), np.argmin(noise)))
+    return Finding(
+        "noisy_view", LIMITS, Subject(views=views), float(noise.max()), limit=float(noise.min()), unit="px"
     )
 
 
@@ -527,11 +510,7 @@ def _model_fields(result: Projective, solution: Solution, check: ModelCheck) -> 
     """Fields of the record on deviations from the model."""
     fields: dict[str, Any] = {"predicted_recorded_px": check.recorded_px}
     if check.unshown is not None:
-        fields["unshown_error"] = (check.unshown.code,)
-        fields["unshown_numbers"] = np.array(check.unshown.numbers)
         fields["predicted_worst_px"] = float(np.hypot(check.predicted_px, check.unshown.effect_px))
     if check.errors:
-        fields["model_error"] = tuple(one.code for one in check.errors)
-        fields["model_error_numbers"] = np.array([one.numbers for one in check.errors])
         fields["model_error_bias"] = result.bias(solution, check.bias)
     return fields

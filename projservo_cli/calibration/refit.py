@@ -26,7 +26,6 @@ from projservo_cli.calibration.detections import (
     Detections,
     cauchy_weights,
     even_choice,
-    format_motion,
     per_block,
     per_rad,
 )
@@ -42,6 +41,7 @@ from projservo_cli.calibration.prediction import (
 )
 from projservo_cli.calibration.robust_fit import MAX_PREDICTED, REFUSE_RATIO, inverse_root
 from projservo_cli.calibration.views import resected
+from projservo_cli.findings import LIMITS, REFUSES, Finding, Subject
 from projservo_cli.geometry.lens import TERMS, undistort
 from projservo_cli.image_size import ImageSize, image_sizes
 from projservo_cli.records import (
@@ -56,6 +56,7 @@ from projservo_cli.records import (
     WorkFailed,
     apart,
 )
+from projservo_cli.words import quantity, with_findings
 
 # Minimum number of detections: a camera has 11 numbers, and as many are left to judge them.
 _LEAST = 12
@@ -137,7 +138,7 @@ class _Images:
         known, columns = np.isin(seen.marker, c.marker), [c.view.index(name) for name in seen.view]
         shape = (len(seen.q), len(c.view), np.count_nonzero(known))
         pixels, sigma = np.full((*shape, 2), np.nan), None
-        pixels[:, columns] = without_placeholders(seen.images)[0][:, :, known]
+        pixels[:, columns] = without_placeholders(seen.images, seen.marker)[0][:, :, known]
         if seen.sigma is not None:
             sigma = np.ones(shape)
             sigma[:, columns] = seen.sigma[:, :, known]
@@ -400,7 +401,7 @@ def _require_confirmed(camera: _Camera) -> float:
     effect = np.abs(offset) * np.sqrt(np.diagonal(Y.T @ Y)[k : k + n] / count)
 
     def motions(i: int, *amounts: float) -> list[str]:
-        return [format_motion(per[i] * amount, bool(params.prismatic[i])) for amount in amounts]
+        return [quantity(per[i] * amount, "m" if params.prismatic[i] else "rad") for amount in amounts]
 
     i = int(np.argmax(gain))
     std = float(np.sqrt(max((left[n, n] - gain[i]) / (count - k - 1), 1.0) / square[i]))
@@ -508,19 +509,15 @@ def _error_px(c: Calibration, v: int, low: FloatArray, high: FloatArray) -> floa
 def _judged(c: Calibration, v: int, error: list[float], pose_of: IntArray, limit: float) -> Calibration:
     """Calibration with the error of its new camera, now and before, and whether it is usable."""
     name, (now, before), poses = c.view[v], error, np.unique(pose_of).size
-    text = f"the {name} camera, fitted again from {poses} poses, errs by {now:.3g} px within the joint ranges"
-    usable, reason, advice = c.usable, c.reason, c.advice
-    if now > limit:
-        more = f"more than calibration.max_predicted_px = {limit:.3g}"
-        usable, reason = False, f"{text}, {more}: add poses that spread farther"
-    elif now > _MORE * before:
-        advice = (f"{text}, {before:.3g} px before it moved: add poses that spread farther", *advice)
+    code, severity = ("refit_too_coarse", REFUSES) if now > limit else ("refitted_camera", LIMITS)
+    from_poses = (Finding(code, amount=poses, unit="1"),)
+    held, subject = limit if now > limit else before, Subject(views=(name,))
+    told = Finding(code, severity, subject, now, limit=held, unit="px", effect_px=now, others=from_poses)
     grown: dict[str, Any] = {}
     for field in ("predicted_rms_px", "predicted_p99_px", "predicted_recorded_px", "predicted_worst_px"):
         if (px := getattr(c, field)) is not None:
             grown[field] = float(np.sqrt(max(px**2 + (now**2 - before**2) / len(c.view), 0.0)))
     numbers = np.array([[poses, now, before]])
     numbers = numbers if c.refit_numbers is None else np.concatenate([c.refit_numbers, numbers])
-    return dataclasses.replace(
-        c, usable=usable, reason=reason, advice=advice, refit=(*c.refit, name), refit_numbers=numbers, **grown
-    )
+    c = dataclasses.replace(c, refit=(*c.refit, name), refit_numbers=numbers, **grown)
+    return with_findings(c, (), [told] if now > min(limit, _MORE * before) else [])

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
 
@@ -10,13 +10,22 @@ import numpy as np
 from scipy.special import chdtri
 
 from projservo_cli.calibration.bundle_adjustment import JointErrors, LeastSquares, fit_offsets, minimize
-from projservo_cli.calibration.detections import MAX_JUDGED, RAYLEIGH, even_choice, medians, per_rad
+from projservo_cli.calibration.detections import (
+    MAX_JUDGED,
+    RAYLEIGH,
+    Detections,
+    even_choice,
+    medians,
+    per_rad,
+)
 from projservo_cli.calibration.epipolar import OUTLIER, ImageGeometry
 from projservo_cli.calibration.initialization import Nominal, Search, starting_markers, starts
 from projservo_cli.calibration.joint_noise import NO_JOINT_NOISE, JointNoise
 from projservo_cli.calibration.prediction import Parameters
 from projservo_cli.calibration.triangulation import Tracks
+from projservo_cli.findings import LIMITS, REFUSES, Finding, Subject
 from projservo_cli.records import BoolArray, Errors, FloatArray, IntArray, WorkFailed
+from projservo_cli.words import refused
 
 # Fitted over expected noise above which residuals exceed pixel noise.
 WARN_RATIO = 1.15
@@ -56,8 +65,6 @@ _POSE_TAIL = 1e-7
 _MIN_SHARE = 0.25
 # Noise over that of the rig after the robust search above which a start is wrong.
 _HOPELESS = 10.0
-# Remedy of a fit that is refused, where no deviation from the model explains it.
-CHECK_READINGS = "; check the joint readings, their units and types, and the marker numbers"
 # Minimum relative gain over ``_PATIENCE`` steps of a robust search whose result would be refused so far.
 _CRAWL = 0.01
 # Number of steps over which this gain is measured.
@@ -86,6 +93,12 @@ _MIN_LEFT = 1e-2
 
 class Misfit(WorkFailed):
     """No model of the robot describes the data."""
+
+    @classmethod
+    def by(cls, findings: Iterable[Finding], detections: Detections) -> "Misfit":
+        """Return the refusal by findings, in words."""
+        findings = tuple(findings)
+        return cls(refused(findings, detections.setup), findings=findings)
 
 
 @dataclass(frozen=True, eq=False)
@@ -268,7 +281,7 @@ class Expected:
 
     sigma_px: float  # given noise, else that of the epipolar geometry
     known: bool  # whether it is the true noise of a simulation, so that χ² decides
-    origin: str  # its origin, for messages
+    origin: str  # its origin: given, stated, views, body, or stated, by one of these
     error: float  # its relative standard error, zero if given
     scale: float | None = None  # true over stated deviations, if the images determine it
     scale_interval: FloatArray | None = None  # (2,) of 95 %
@@ -285,18 +298,18 @@ class Expected:
         independent of the joints, determine it; it is one if its interval contains one.
         """
         if sigma_px is not None:
-            return cls(sigma_px, source == "simulated", "that were given", 0.0)
+            return cls(sigma_px, source == "simulated", "given", 0.0)
         if stated_px is None:
             error = epipolar.relative_error
             return cls(epipolar.noise_px, False, epipolar.origin, error, min_px=epipolar.min_px)
-        origin = "that the sigmas of the markers state"
+        origin = "stated"
         if source == "simulated":
             return cls(stated_px, True, origin, _STATED_ERROR)
         low, high = interval = epipolar.core.interval / stated_px
         if low <= 1.0 <= high:
             return cls(stated_px, False, origin, _STATED_ERROR, 1.0, interval, min_px=epipolar.min_px)
         scale = epipolar.core.sigma_px / stated_px
-        origin = f"{origin}, times {scale:.3g} (95 %: {low:.3g} to {high:.3g}) as {epipolar.shown}"
+        origin = f"{origin}, by {epipolar.origin}"
         stated_px, shown, min_px = scale * stated_px, epipolar.shown, epipolar.min_px
         return cls(stated_px, False, origin, _STATED_ERROR, scale, interval, shown, min_px)
 
@@ -336,25 +349,23 @@ class Expected:
             return low <= self.ratio(solution) ** 2 <= high
         return not self.warns(solution)
 
-    def refusal(self, solution: Solution) -> str | None:
-        """Return the reason why a fit must not pass, or None if it may."""
+    def finding(self, code: str, severity: str, solution: Solution) -> Finding:
+        """Finding on the residuals of a fit, beside the noise and its origin."""
+        scale = () if self.scale is None else (Finding("stated_scale", amount=self.scale, unit="1"),)
+        numbers = solution.sigma_px, math.nan, self.sigma_px, "px"
+        return Finding(code, severity, Subject(name=self.origin), *numbers, others=scale)
+
+    def refusal(self, solution: Solution) -> Finding | None:
+        """Return the finding by which a fit must not pass, or None if it may."""
         ratio = self.ratio(solution)
         if self.known and not self.agrees(solution):
             low, high = chi2_band(solution.dof)
-            joints, remedy = "", ""
-            if (noise := solution.joint_noise) is not None and noise.sigma_q > 0.0:
-                joints = f" and {np.degrees(noise.sigma_q):.3g}° rms of joint noise"
-                remedy = "; check joint_noise_deg"
-            return (
-                f"the fit does not describe the data: χ² per degree of freedom is {ratio**2:.4g} at "
-                f"{self.sigma_px:g} px of noise{joints}, expected within {low:.4g} and {high:.4g}{remedy}"
-            )
-        if ratio > REFUSE_RATIO:
-            return (
-                f"the fit does not describe the data: residuals of {solution.sigma_px:.3g} px a coordinate "
-                f"are {ratio:.3g} times the {self.sigma_px:.3g} px {self.origin}" + CHECK_READINGS
-            )
-        return None
+            sigma_q = 0.0 if solution.joint_noise is None else solution.joint_noise.sigma_q
+            joints = (Finding("joint_noise", amount=sigma_q, unit="rad"),) if sigma_q > 0.0 else ()
+            band = Finding("chi2_band", amount=low, limit=high, unit="1")
+            of_noise = Finding("noise", amount=self.sigma_px, unit="px")
+            return Finding("chi2", REFUSES, amount=ratio**2, unit="1", others=(of_noise, band, *joints))
+        return self.finding("misfit", REFUSES, solution) if ratio > REFUSE_RATIO else None
 
 
 def chi2_band(dof: int) -> tuple[float, float]:
@@ -586,15 +597,15 @@ def left_out_errors(few: Solution) -> FloatArray:
     return np.asarray(error)
 
 
-def solve(search: Search, expected: Expected, nominal: Nominal | None) -> tuple[Solution, str]:
-    """Best fit, and advice about a given start that did not lead there, else empty.
+def solve(search: Search, expected: Expected, nominal: Nominal | None) -> tuple[Solution, Finding | None]:
+    """Best fit, and a finding on a given start that did not lead there.
 
     A start is accepted if its fit leaves the expected noise; else a search from the images alone competes.
 
     Raises InputError if the start is for other joints or markers; WorkFailed if neither succeeds.
     """
     if nominal is None:
-        return _solve_from_images(search, expected), ""
+        return _solve_from_images(search, expected), None
     problem, found = search.problem, None
     params = nominal.start(problem.detections, problem.q_reference)
     pixels, depth = problem.pixels(params)
@@ -603,24 +614,18 @@ def solve(search: Search, expected: Expected, nominal: Nominal | None) -> tuple[
     if found is not None:
         explained = fit_joint_noise(found, expected, search.joint_noise)
         if expected.agrees(explained):
-            return explained, ""
+            return explained, None
     try:
         searched = _solve_from_images(search, expected)
     except WorkFailed:
         if found is None or expected.refusal(found) is not None:
             raise
-        return found, ""
+        return found, None
     if found is not None and found.typical_px <= (1.0 + _SAME_LEVEL) * searched.typical_px:
-        return found, ""
-    leads = (
-        "does not put the markers in front of both cameras"
-        if found is None
-        else f"leads to residuals of {found.typical_px:.3g} px instead of {searched.typical_px:.3g} px"
-    )
-    return searched, (
-        f"{nominal.where} was not used as a start: it {leads}; the calibration comes from the images alone, "
-        "so check whether the file describes this robot and rig"
-    )
+        return found, None
+    level = math.nan if found is None else found.typical_px
+    subject = Subject(name=nominal.where)
+    return searched, Finding("unused_start", LIMITS, subject, level, limit=searched.typical_px, unit="px")
 
 
 def _solve_from_images(search: Search, expected: Expected) -> Solution:
@@ -675,10 +680,7 @@ def _solve_from_images(search: Search, expected: Expected) -> Solution:
             if not np.array_equal(before, trusted):
                 levels = []
     if best is None:
-        raise Misfit(
-            "the data contradict the joint readings from the start: check that they belong to their poses, "
-            "their units (rad, m) and types (R or P), and that rows of one pose belong together"
-        )
+        raise Misfit.by([Finding("no_start", REFUSES)], whole.detections)
     return best
 
 

@@ -113,7 +113,7 @@ class RigidBody(ImageGeometry):
     marker: IntArray  # (m,) numbers of the markers in the fit
     dof: int
 
-    origin, shown = "that a rigid body shows", "a rigid body shows"
+    origin, shown = "body", "a rigid body shows"
 
     @classmethod
     def of(cls, detections: Detections, frame: ImageFrame) -> "RigidBody":

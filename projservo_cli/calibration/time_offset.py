@@ -15,7 +15,9 @@ from scipy.special import stdtrit
 
 from projservo_cli.calibration.detections import MAD, per_rad
 from projservo_cli.calibration.prediction import joint_derivative, predict
+from projservo_cli.findings import LIMITS, Finding, Subject
 from projservo_cli.records import Calibration, FloatArray, InputError, IntArray, Observation
+from projservo_cli.words import with_findings
 
 # Minimum time offset searched, s: stamps of another clock may be early.
 _EARLIEST = -0.1
@@ -174,8 +176,7 @@ def with_time_offset(calibration: Calibration, observation: Observation) -> Cali
         ("t_q", *(f"t_{name}" for name in observation.view)), _stamps(observation)[:, moving > 0], strict=True
     ):
         if t.size >= _MIN_FRAMES and (t == np.rint(t)).all() and (np.diff(t) == 0.0).any():
-            whole = f"{name} of poses in motion are whole seconds, so no latency of the images was estimated"
-            return replace(calibration, advice=(*calibration.advice, f"{whole}: record their fractions"))
+            return with_findings(calibration, [Finding("whole_seconds", LIMITS, Subject(name=name))])
     views = [_Frames.of(calibration, observation, view, moving, t_q) for view in range(len(observation.view))]
     found = [result for result in map(_time_offset, views) if result is not None]
     if len(found) < len(views):

@@ -357,6 +357,7 @@ def _validate(
     from projservo_cli.records import WorkFailed
     from projservo_cli.store.observation_tables import read_detections, read_table
     from projservo_cli.store.run_file import load
+    from projservo_cli.words import order_advice
 
     found = load(target)
     calibration = found.calibration
@@ -416,7 +417,7 @@ def _validate(
         moved, *others = (one["view"] for one in beyond)
         remedy = f"if it moved, fit it again: projservo calibrate {target} --refit {moved} --data {data}"
         reason += " in some cameras alone" if others else " in one camera alone"
-    left_open, n = calibration.order_advice, len(calibration.joint_types)
+    left_open, n = order_advice(calibration), len(calibration.joint_types)
     order = calibration.undecided_order
     if order is not None and order.size == n * (n - 1):  # all reversed is the other mount
         left_open += "; no pose shows whether the cameras are on the tool (--mount) either"

@@ -264,6 +264,7 @@ def _write_tables(run: Any, folder: Path) -> Iterator[Path]:
     import numpy as np
 
     from projservo_cli.files import write_whole
+    from projservo_cli.findings import sparse
     from projservo_cli.store.observation_tables import to_csv
 
     rows, tables = [], {}
@@ -283,7 +284,7 @@ def _write_tables(run: Any, folder: Path) -> Iterator[Path]:
             elif isinstance(value, (str, float)):
                 values = str(value)
             else:
-                values = json.dumps(value, ensure_ascii=False)
+                values = json.dumps(value, ensure_ascii=False, default=sparse)
             about = (field.metadata["units"], field.metadata["about"])
             rows.append((file, field.name, " ".join(dims or ()), *about, values))
         tables[file] = to_csv(arrays, down=0)

@@ -135,22 +135,27 @@ def _of_recording(value: dict[str, Any], _: bool) -> Iterator[str]:
 
 def _of_calibration(value: dict[str, Any], detailed: bool) -> Iterator[str]:
     px, bound = (_number(value[f"predicted_{name}_px"]) for name in ("rms", "p99"))
-    sound = value["usable"] and {*value["advice"]} <= {*value["notes"]}
     asked = (
         detailed
         or value["lens"]
         or value.get("joint_model")
         or value.get("cross_validation")
         or len(value["joints"]) == 1
+        or value["predicted_rms_px"] is None
     )
-    if sound and value["predicted_rms_px"] is not None and not asked:
-        limit = "" if value["limit"] == "noise" else f" limited by {value['limit']};"
-        found = f"predicts images to {px} px rms, 99 % below {bound};{limit} more: -v"
-        yield wrapped(f"calibrate: usable: {found}")
+    if asked:
+        yield from _in_detail(value)
+    else:
+        notes = len(value["notes"]) + (value["unshown"] is not None)
+        more = f"{notes} note{'s' * (notes > 1)} and more: -v" if notes else "more: -v"
+        found = f"predicts images to {px} px rms, 99 % below {bound}; {more}"
+        usable = value["usable"]
+        yield wrapped(f"calibrate: {f'usable: {found}' if usable else 'NOT usable: ' + value['reason']}")
+        limits = [one["text"] for one in value["findings"][:1] if usable and one["severity"] == "limits"]
+        for text in limits + [text for text in value["advice"] if text not in value["notes"]]:
+            yield wrapped(f"limits: {text}", "  ")
         if value["time_offset_s"] is not None:
             yield wrapped(f"time offset {', '.join(_time_offsets(value))}", "  ")
-    else:
-        yield from _in_detail(value)
     where = " on the tool" if value["mount"] == "tool" else ""
     if where or list(value["view"]) != ["left", "right"]:
         views = value["view"]

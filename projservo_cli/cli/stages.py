@@ -520,7 +520,8 @@ def _work(console: Console, chain: "Chain", options: Mapping[str, Any]) -> int:
             reason = chain.reason if chain.lacks(name) else ""
             values[name] = {"run": chain.run.path.resolve()} | _recording_object(chain.recording, reason)
         elif chain.lacks(name):
-            values[name] = failed_object(name, chain.run, chain.reason, chain.failed, chain.laws_done)
+            why = chain.reason, chain.evidence
+            values[name] = failed_object(name, chain.run, why, chain.failed, chain.laws_done)
         else:
             values[name] = stage_object(name, chain.run, joints, chain.laws)
             values[name] |= beside.get(name, {})

@@ -6,6 +6,7 @@ import numpy as np
 
 from projservo_cli.monitoring.hypotheses import ALL, Explanation
 from projservo_cli.records import CORNERS, TOOL, WORLD, Calibration, FloatArray
+from projservo_cli.words import joined
 
 # By so much a link may flex under its load, rad, which looks like a joint that slipped.
 _FLEXIBLE = np.radians(1.0)
@@ -69,7 +70,7 @@ def sentence(explanation: Explanation, calibration: Calibration) -> str:
     return (_SENTENCES | special)[kind].format(
         joint="all joints" if i < 0 else f"joint {i + 1}",
         camera=_cameras(views, names),
-        each=_listed([f"the {names[v]}" for v, shown in enumerate(views) if v != shown]) + " camera",
+        each=joined([f"the {names[v]}" for v, shown in enumerate(views) if v != shown]) + " camera",
         was="was" if len(views) == 1 else "were",
         it="it" if len(views) == 1 else "them",
         px=f"{explanation.seen_px:.2g} px",
@@ -84,12 +85,7 @@ def _cameras(views: tuple[int, ...], names: Sequence[str]) -> str:
     """Name the cameras of some of the views."""
     if 1 < len(views) == len(names):
         return "both cameras" if len(views) == 2 else "all cameras"
-    return f"the {_listed([names[v] for v in views])} camera{'s' * (len(views) > 1)}"
-
-
-def _listed(words: Sequence[str]) -> str:
-    """Join words by commas, the last by "and"."""
-    return " and ".join(filter(None, (", ".join(words[:-1]), words[-1] if words else "")))
+    return f"the {joined([names[v] for v in views])} camera{'s' * (len(views) > 1)}"
 
 
 def _moved(explanation: Explanation, calibration: Calibration) -> str:

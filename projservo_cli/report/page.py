@@ -86,8 +86,7 @@ def _law_words(trace: Mapping[str, Any]) -> str:
     """Verdict of a law and its reason, in one sentence."""
     steps, reason = trace["steps"], trace["reason"]
     took = f"{steps} step{'s' * (steps != 1)} ({short(steps * trace['period'])} s)"
-    because = ", because the " if reason.startswith("image error") else ": "
-    why = because + reason if reason else ""
+    why = f": {reason}" if reason else ""
     return f"{title(run_name(trace['law'], trace['mode']))}: {trace['verdict']} after {took}{why}."
 
 

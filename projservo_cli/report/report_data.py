@@ -5,15 +5,15 @@ run, the truth behind it, and numbers read off both.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from projservo_cli.calibration.checks.model_error import describe
 from projservo_cli.calibration.joint_model import describe_curve
+from projservo_cli.findings import Finding, named, of_readings
 from projservo_cli.geometry.kinematics import project
 from projservo_cli.laws import IMAGE_TRACK, POINT_LAWS, REGULATE, TRACK, law_and_mode, title_of
 from projservo_cli.metric.frame import Metric
@@ -27,7 +27,6 @@ from projservo_cli.records import (
     CrossValidation,
     FloatArray,
     Model,
-    ModelError,
     Observation,
     Plan,
     Trace,
@@ -38,6 +37,7 @@ from projservo_cli.settings.task import Trajectory
 from projservo_cli.simulation.analytic_plant import Plant
 from projservo_cli.simulation.arm import SerialArm
 from projservo_cli.store.run_file import Run
+from projservo_cli.words import line, sentence, setup_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -357,9 +357,12 @@ def stage_object(stage: str, run: Run, names: Sequence[str | None], laws: Sequen
     return path | {"page": page.resolve() if page.is_file() else None} | scalars_of(report)
 
 
-def failed_object(stage: str, run: Run, reason: str, at: str, laws: Sequence[str]) -> dict[str, Any]:
-    """Return the JSON object of a stage that failed, or lacks its inputs."""
-    failure: dict[str, Any] = {"run": run.path.resolve(), "reason": reason, "failed": at}
+def failed_object(
+    stage: str, run: Run, why: tuple[str, Iterable[Finding]], at: str, laws: Sequence[str]
+) -> dict[str, Any]:
+    """Return the JSON object of a stage that failed, or lacks its inputs; why : its reason and findings."""
+    failure: dict[str, Any] = {"run": run.path.resolve(), "reason": why[0], "failed": at}
+    failure["findings"] = [one.plain() for one in why[1]]
     if stage == "calibrate":
         lists: dict[str, Any] = {name: [] for name in ("advice", "joints", *_LISTS)}
         numbers = dict.fromkeys(_NUMBERS) | dict.fromkeys(_COUNTS, 0)
@@ -425,6 +428,8 @@ def _calibration(run: Run, names: Sequence[str | None]) -> dict[str, Any]:
     held_out = {"cross_validation": scalars_of(run.cross_validation)} if run.cross_validation else {}
     values = scalars_of(calibration) | {name: getattr(calibration, name) for name in _SHORT_ARRAYS}
     del values["model_error"], values["unshown_error"]
+    setup = setup_of(calibration)
+    values["findings"] = [one.plain() | {"text": line(one, setup)} for one in calibration.findings]
     of_refits = zip(
         values.pop("refit"),
         () if calibration.refit_numbers is None else calibration.refit_numbers.tolist(),
@@ -445,9 +450,20 @@ def _calibration(run: Run, names: Sequence[str | None]) -> dict[str, Any]:
     return values | {"joints": joints, "lens": lens} | findings(calibration) | held_out
 
 
-def _in_words(error: ModelError, calibration: Calibration) -> dict[str, Any]:
-    """Fields of a deviation from the model, and a sentence."""
-    return error._asdict() | {"text": describe(error, calibration.prismatic)[1]}
+def _in_words(one: Finding, calibration: Calibration) -> dict[str, Any]:
+    """Fields of a deviation from the model, and a sentence; readings in rad (prismatic × 0.3 m/rad)."""
+    estimate, deviation = of_readings(one)
+    return {
+        "kind": one.code,
+        "joints": one.subject.joints,
+        "view": "".join(one.subject.views),
+        "estimate": estimate,
+        "deviation": deviation,
+        "effect_px": one.effect_px,
+        "first": next(iter(one.subject.poses), None),
+        "others": [named(other) for other in one.others],
+        "text": sentence(one, setup_of(calibration)),
+    }
 
 
 # Numbers of the object that carries the goal of a plan.

@@ -15,6 +15,7 @@ from projservo_cli.calibration.pipeline import calibrate
 from projservo_cli.calibration.refit import refit, since_moved
 from projservo_cli.calibration.robust_fit import Solution
 from projservo_cli.files import write_whole
+from projservo_cli.findings import LIMITS, Finding, Subject
 from projservo_cli.geometry.lens import K1
 from projservo_cli.nominal import read_nominal
 from projservo_cli.observations import Observations
@@ -41,6 +42,7 @@ from projservo_cli.stages.stage_inputs import (
     Trials,
 )
 from projservo_cli.store.observation_tables import mount_in, read_detections, read_table, to_csv
+from projservo_cli.words import Setup, lines, with_findings
 
 _Calibrated = tuple[Observation, Calibration, CrossValidation | None]
 
@@ -161,7 +163,10 @@ def estimate(
         while board.turn_by(calibration):
             calibration = fitted_to(board.observation)
     except WorkFailed as error:
-        raise type(error)("; ".join((str(error), *screening.advice, *board.advice))) from error
+        found = [*screening.findings, *board.findings]
+        setup = Setup(seen.mount, board.observation.view, len(seen.joint_types))
+        words, findings = "; ".join((str(error), *lines(found, setup))), (*error.findings, *found)
+        raise type(error)(words, findings=findings) from error
     calibration = replace(
         calibration,
         source=seen.source,
@@ -171,8 +176,12 @@ def estimate(
         undecided_order=order[0] if order else None,
         turned_images=board.images,
     )
-    advice = filter(None, (*calibration.advice, calibration.order_advice, *screening.advice, *board.advice))
-    return board.observation, replace(calibration, advice=tuple(advice)), next(iter(held_out), None)
+    of_order = list[Finding]()
+    if order and order[0].size:
+        pairs = Subject(joints=tuple(np.unique(order[0]).tolist()))
+        of_order.append(Finding("undecided_order", LIMITS, pairs))
+    found = [*of_order, *screening.findings, *board.findings]
+    return board.observation, with_findings(calibration, found), next(iter(held_out), None)
 
 
 def suggest_motions(

@@ -61,6 +61,7 @@ from projservo_cli.task.visibility import (
     visibility_angles,
     visibility_translation,
 )
+from projservo_cli.words import order_advice
 
 
 def _partitioned(
@@ -146,7 +147,7 @@ def run(
     face = metric_points(scenario.model, calibration.M[calibration.indices_of(inputs.face)])
     notes = [
         plan.reason,
-        calibration.order_advice,
+        order_advice(calibration),
         _borders(inputs, calibration.view),
         "" if face is None else _uneven(face),
     ]

@@ -64,6 +64,7 @@ from projservo_cli.task.incidences import (
     whole_pose,
 )
 from projservo_cli.task.target import TaskImages, followed
+from projservo_cli.words import order_advice
 
 _RETREAT = 10  # periods by which an arm goes back where the object of its goal moves
 _NOT_DRIVEN: Any = None  # in place of what a run leaves
@@ -167,7 +168,7 @@ class LawRun:
         own = scenario.truth is None
         if own and (scenario.calibration is None or not scenario.calibration.usable):
             raise WorkFailed("the calibration is not usable, and no robot is driven with it: calibrate again")
-        if own and scenario.calibration is not None and (order := scenario.calibration.order_advice):
+        if own and scenario.calibration is not None and (order := order_advice(scenario.calibration)):
             raise InputError(
                 f"{order}, or set data.joint_order=stated if it is known; no robot is driven before"
             )

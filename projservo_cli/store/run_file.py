@@ -30,6 +30,7 @@ import numpy.typing as npt
 from pydantic import TypeAdapter, ValidationError
 
 from projservo_cli.files import replacing
+from projservo_cli.findings import LIMITS, NOTE, REFUSES, Finding, Subject, of_columns, sparse
 from projservo_cli.records import (
     SIZES,
     VIEWS,
@@ -43,6 +44,7 @@ from projservo_cli.records import (
     Trace,
     scalars_of,
 )
+from projservo_cli.words import Setup, line, sentence
 
 if typing.TYPE_CHECKING:
     import h5netcdf
@@ -404,7 +406,9 @@ def as_attribute(value: Any) -> Any:
     """Encode an attribute of HDF5 and netCDF: number or text; other values as JSON."""
     if isinstance(value, (bool, np.bool_)):
         return np.int8(value)
-    return value if isinstance(value, (str, int, float, np.number)) else json.dumps(value)
+    if isinstance(value, (str, int, float, np.number)):
+        return value
+    return json.dumps(value, default=sparse)
 
 
 def load_record(group: h5py.Group, kind: Any, sizes: dict[str, int]) -> Any:
@@ -428,6 +432,8 @@ def load_record(group: h5py.Group, kind: Any, sizes: dict[str, int]) -> Any:
         else:
             values[name] = _array(_member(group, name), dims, inner, own)
     _require_names(group, {*values, *own})
+    if kind is Calibration and "findings" not in group.attrs:
+        values["findings"] = _told(values)
     if "view" in values and len(values["view"]) != own.get("view", len(values["view"])):
         raise ValueError(f"{group.name} has arrays of {own['view']} views, named {', '.join(views)}")
     if "joint" in own:
@@ -435,6 +441,25 @@ def load_record(group: h5py.Group, kind: Any, sizes: dict[str, int]) -> Any:
     if "joint_types" in values and not re.fullmatch(f"[RP]{{{own['joint']}}}", values["joint_types"]):
         raise ValueError(f"joint_types are not {own['joint']} letters R and P")
     return kind(**values)
+
+
+def _told(values: Mapping[str, Any]) -> tuple[Finding, ...]:
+    """Findings of a calibration of an earlier version, which stored sentences and columns alone."""
+    units = ["m" if letter == "P" else "rad" for letter in values["joint_types"]]
+    found = [Finding("told", NOTE if values["usable"] else REFUSES, Subject(name=values["reason"]))]
+    rows = () if values["model_error_numbers"] is None else values["model_error_numbers"].tolist()
+    found += [of_columns(*one, units) for one in zip(values["model_error"], rows, strict=True)]
+    order = values["undecided_order"]
+    if order is not None and order.size:
+        found.append(Finding("undecided_order", LIMITS, Subject(joints=tuple(np.unique(order).tolist()))))
+    for one in values["unshown_error"]:
+        hidden = of_columns(one, values["unshown_numbers"].tolist(), units)
+        found.append(Finding("unshown", effect_px=hidden.effect_px, others=(hidden,)))
+    known = {text for one in found for text in (line(one, Setup()), sentence(one, Setup()))}
+    for text in values["advice"]:
+        if text not in known:
+            found.append(Finding("told", NOTE if text in values["notes"] else LIMITS, Subject(name=text)))
+    return tuple(found)
 
 
 def _has_default(field: "dataclasses.Field[Any]") -> bool:

@@ -127,6 +127,18 @@ def test_case_34_few_corners_seen(case, answer):
     assert (code, found["usable"]) in ((0, True), (1, False))
 
 
+def test_case_38_joint_named_for_a_camera_on_the_tool(case, answer):
+    folder = case("38_joint_named_for_a_camera_on_the_tool")
+    words = "--mount", "tool", "--joints", "PPPRRR", "--image-size", "1600x1200"
+    code, found, error = answer("calibrate", "--data", folder / "t.csv", *words, "-o", "out")
+    assert (code, found["usable"]) == (1, False)
+    for one in found["findings"]:
+        if joints := one["subject"].get("joints"):
+            assert one["unit"] == ("m" if max(joints) <= 3 else "rad")
+    assert "off by 90 mm" in error
+    assert "on the tool" not in error
+
+
 @pytest.mark.parametrize("stated", [(), ("--noise-px", 0.3)])
 def test_case_30_no_pixel_noise(case, answer, stated):
     """Images projected from estimated poses: no two markers show the noise, and joints take its errors."""

@@ -39,7 +39,7 @@ def test_case_15_sentinel_9999(case, answer):
         "u = 9999, v = 9999 stands in 158 rows of several markers and poses"
     )
     assert (found["rejected"]["placeholders"], empty["rejected"]["placeholders"]) == (170, 0)
-    apart = {"advice", "placeholders", "rejected", "run", "seconds"}
+    apart = {"advice", "findings", "notes", "placeholders", "rejected", "run", "seconds"}
     assert {k: v for k, v in found.items() if k not in apart} == {
         k: v for k, v in empty.items() if k not in apart
     }

@@ -61,7 +61,7 @@ def test_neighbours_prove_which_images_are_turned(case):
     assert len(found.images) == np.count_nonzero(found.turn)
     as_is = BoardNumbering.by_joints(right, types)
     assert as_is.observation is right
-    assert as_is.advice == ()
+    assert as_is.findings == ()
 
 
 def test_a_wrist_that_turns_by_half_a_turn_is_no_turned_board():

@@ -7,7 +7,8 @@ import pytest
 
 from projservo_cli.calibration import calibrate, predict
 from projservo_cli.calibration.checks import model_error
-from projservo_cli.records import ModelError, Observation, WorkFailed
+from projservo_cli.findings import DEVIATIONS, REFUSES
+from projservo_cli.records import Observation, WorkFailed
 from tests.calibration.simulated_robot import around, random_robot, trials
 from tests.studies.combined_mistakes import bump
 
@@ -60,8 +61,8 @@ def test_a_fault_is_named_and_its_effect_stated(seed, i, fault):
     error = float(np.sqrt(2.0 * np.mean((predict(found, q) - true) ** 2)))
     assert error <= 2.0 * found.predicted_rms_px
     first = found.model_errors[0]
-    assert (first.kind, first.joints) == expected(i)
-    assert abs(first.estimate - size) <= 5.0 * first.deviation + 0.05 * abs(size)
+    assert (first.code, first.subject.joints) == expected(i)
+    assert abs(first.amount - size) <= 5.0 * first.deviation + 0.05 * abs(size)
     assert found.predicted_rms_px <= 3.0 * error
 
 
@@ -80,25 +81,15 @@ def test_a_large_effect_is_not_usable_until_it_is_accepted():
     refused = calibrate(seen, TYPES, source="recorded", max_predicted_px=0.1)
     accepted = calibrate(seen, TYPES, source="recorded", max_predicted_px=1e3)
     assert (refused.usable, accepted.usable) == (False, True)
+    told = [(one.code, one.severity, one.subject.joints) for one in refused.findings]
+    assert ("scale", REFUSES, (3,)) in told
     assert "calibration.max_predicted_px = 0.1" in refused.reason
     assert "gear of joint 3" in accepted.reason
     np.testing.assert_array_equal(refused.P, accepted.P)
 
 
-def test_every_kind_has_words_and_a_code():
-    """Sizes are told in per cent, degrees, mm and px, and a code leads back to the record."""
-    prismatic = np.array([False, True])
-    for kind in model_error._SIZES:
-        joints = {"coupling": (1, 2), "base": (), "tool": ()}.get(kind, (1,))
-        one = ModelError(kind, joints, "left", -0.02, 0.001, 0.5, 3, ("joint_step|2|", "base||"))
-        assert ModelError.of(one.code, one.numbers) == one
-        limit, sentence = model_error.describe(one, prismatic)
-        assert limit
-        assert (
-            "(or step of joint 2, or motion of the base or the cameras: the images do not tell)" in sentence
-        )
-        assert any(unit in sentence for unit in ("%", "°", "px", "mm"))
-    assert "mm" in model_error.describe(ModelError("joint_step", (2,), "", 0.02, 0.001, 0.5, 3), prismatic)[1]
+def test_every_kind_has_a_usual_size():
+    assert {*model_error._SIZES} == {*DEVIATIONS}
 
 
 @pytest.mark.parametrize(

@@ -1,12 +1,11 @@
 """What the verdict says: how far to move a joint, what limits."""
 
-import re
-
 import numpy as np
 import pytest
 
 from projservo_cli.calibration import WEAK_NOISE, calibrate
-from projservo_cli.calibration.detections import describe_joints
+from projservo_cli.calibration.detections import Detections, weak_joints
+from projservo_cli.findings import LIMITS, NOTE
 from projservo_cli.records import Observation
 from tests.calibration.simulated_robot import random_robot, trials
 
@@ -47,9 +46,9 @@ def weak(robot):
 
 def advised(found):
     """Range in the advice about the weak joint, rad or m."""
-    text = next(text for text in found.advice if text.startswith("joint 2 moved only"))
-    number, unit = re.search(r"at least ([\d.]+)(°| mm)$", text).groups()
-    return np.radians(float(number)) if unit == "°" else 1e-3 * float(number)
+    return next(
+        one.limit for one in found.findings if one.code == "little_motion" and 2 in one.subject.joints
+    )
 
 
 def test_the_range_advised_is_the_one_that_suffices(robot, weak):
@@ -71,25 +70,26 @@ def test_what_limits_is_said(robot, weak):
 
 
 @pytest.mark.parametrize(
-    ("span", "prismatic", "needed", "text"),
+    ("span", "prismatic", "needed", "code"),
     [
-        (0.05, False, 0.2, "joint 4 moved only 2.86°: move it at least 11.5°"),
-        (0.05, False, 0.03, "joint 4 moved 2.86°, in too few poses: record further ones in which it "
-         "moves alone, by 1.72° or more"),
-        (0.01, True, 0.05, "joint 4 moved only 10 mm: move it at least 50 mm"),
-        (1.0, False, 0.2, "joint 4 moved 57.3° but hardly apart from the other joints: move it "
-         "alone, by 11.5° or more"),
-        (1.0, False, np.nan, "joint 4 moved 57.3°; no motion of it alone would do: record trials of "
-         "every joint"),
+        (0.05, False, 0.2, "little_motion"),
+        (0.05, False, 0.03, "joint_in_few_poses"),
+        (0.01, True, 0.05, "little_motion"),
+        (1.0, False, 0.2, "joint_together"),
+        (1.0, False, np.nan, "hopeless_joint"),
     ],
-)  # fmt: skip
-def test_advice_in_words(span, prismatic, needed, text):
+)
+def test_a_joint_that_is_hardly_determined_and_its_remedy(span, prismatic, needed, code):
     # The fourth of four joints; the others are not in doubt.
+    types = "RRR" + "RP"[prismatic]
+    robot = random_robot(types, np.random.default_rng(3))
+    detections = Detections.of(robot.observe(trials(robot, 2), 0.0, np.random.default_rng(0)), types)
     spans, ranges = np.full(4, 1.0), np.full(4, 0.1)
     spans[3], ranges[3] = span, needed
-    which = np.array([3])
-    kinds, numbers = np.array([False] * 3 + [prismatic]), np.arange(1, 5)
-    assert describe_joints(which, spans, kinds, ranges, numbers) == (text,)
+    (found,) = weak_joints(np.array([3]), spans, ranges, detections, np.zeros(4))
+    assert (found.code, found.severity, found.subject.joints) == (code, LIMITS, (4,))
+    assert (found.amount, found.unit) == (span, "m" if prismatic else "rad")
+    assert found.limit == needed or np.isnan(needed)
 
 
 def test_joints_that_are_off_are_told_in_px_and_no_joint_is_to_move_for_them():
@@ -103,7 +103,6 @@ def test_joints_that_are_off_are_told_in_px_and_no_joint_is_to_move_for_them():
     effect = np.sqrt(np.mean((robot.images(q + off) - robot.images(q)) ** 2))
     observation = Observation(found.pose, found.marker, q + off, images, sigma=sigma)
     calibration = calibrate(observation, "RRR", source="recorded", joint_noise=None)
-    assert "limited by joint readings" in calibration.reason
-    (text,) = (text for text in calibration.advice if "move images" in text)
-    assert float(re.search(r"by ([\d.]+) px", text)[1]) == pytest.approx(effect, rel=0.35)
-    assert not any("alone" in text for text in calibration.advice)
+    limits = [one for one in calibration.findings if one.severity != NOTE]
+    assert [one.code for one in limits] == ["coarse_joints"]
+    assert limits[0].effect_px == pytest.approx(effect, rel=0.35)

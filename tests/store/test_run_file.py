@@ -8,6 +8,7 @@ import h5py
 import numpy as np
 import pytest
 
+from projservo_cli.findings import usable
 from projservo_cli.records import InputError, Plan, Trace
 from projservo_cli.results import RunTrace
 from projservo_cli.store import run_file
@@ -47,6 +48,16 @@ def refused(path):
     assert "\n" not in message
     assert len(message) < 500
     return message
+
+
+def test_a_calibration_of_an_earlier_version_has_its_sentences_as_findings(path):
+    before = run_file.load(path).calibration
+    edited(path, head("calibrate/calibration", "findings", None))
+    calibration = run_file.load(path).calibration
+    assert (calibration.reason, calibration.advice) == (before.reason, before.advice)
+    told = [one.subject.name for one in calibration.findings if one.code == "told"]
+    assert told == [before.reason, *before.advice]
+    assert usable(calibration.findings) == before.usable
 
 
 def test_everything_comes_back(tmp_path):

@@ -16,6 +16,7 @@ from projservo_cli.calibration.detections import Detections, even_choice
 from projservo_cli.calibration.epipolar import Epipolar
 from projservo_cli.calibration.prediction import predict
 from projservo_cli.calibration.single_view import moved_plane
+from projservo_cli.findings import LIMITS, Finding, Subject
 from projservo_cli.geometry.displacements import homogeneous
 from projservo_cli.records import (
     BoolArray,
@@ -156,21 +157,18 @@ class BoardNumbering:
         return None if self.grid is None else np.stack([self.given.pose[rows[:, 0]], rows[:, 1]], axis=1)
 
     @property
-    def advice(self) -> tuple[str, ...]:
-        """Say how many images were turned; empty for none."""
+    def findings(self) -> tuple[Finding, ...]:
+        """A finding on the images that were turned, of each view, if there are any."""
         if self.grid is None or not self.turn.any():
             return ()
-        seen = np.asarray(np.isfinite(self.given.images[..., 0]).any(axis=2))
-        each = ", ".join(
-            f"{name} {np.count_nonzero(self.turn[:, v])} of {np.count_nonzero(seen[:, v])}"
-            for v, name in enumerate(self.given.view)
+        seen = np.isfinite(self.given.images[..., 0]).any(axis=2)
+        turned = (np.count_nonzero(self.turn, axis=0), np.count_nonzero(seen, axis=0))
+        each = tuple(
+            Finding("turned_board", subject=Subject(views=(name,)), amount=int(n), limit=int(of), unit="1")
+            for name, n, of in zip(self.given.view, *turned, strict=True)
         )
-        angle, n = 360 // len(self.grid.numberings), np.count_nonzero(self.turn)
-        return (
-            f"the board of {self.grid.columns}x{self.grid.rows} corners looks the same turned by {angle}°: "
-            f"{n} of {seen.sum()} images number it from another end ({each}), and were turned right; a "
-            "ChArUco board, or one with an odd and an even side, needs no turn",
-        )
+        angle = 2.0 * np.pi / len(self.grid.numberings)
+        return (Finding("turned_board", LIMITS, amount=angle, unit="rad", others=each),)
 
 
 def _proven_turns(grid: _Grid, observation: Observation, joint_types: str) -> tuple[IntArray, BoolArray]:

@@ -27,8 +27,9 @@ from projservo_cli.calibration.bundle_adjustment import LeastSquares, minimize
 from projservo_cli.calibration.detections import SAME_READING, Detections, per_rad
 from projservo_cli.calibration.prediction import LENS, Images, Parameters
 from projservo_cli.calibration.robust_fit import Solution
+from projservo_cli.findings import LIMITS, Finding, Subject
 from projservo_cli.geometry.displacements import cross_matrix
-from projservo_cli.records import CORNERS, BoolArray, Errors, FloatArray, IntArray, ModelError
+from projservo_cli.records import CORNERS, BoolArray, Errors, FloatArray, IntArray
 
 # Probability of chance above which no nuisance is found.
 _CHANCE = 1e-4
@@ -100,6 +101,11 @@ class _Nuisance(NamedTuple):
     def like(self) -> tuple[str, int, int, bool]:
         """Key of those that differ in the joint, the view or the tag alone."""
         return self.kind, len(self.joints), self.timed, self.tag is None
+
+    @property
+    def cause(self) -> tuple[str, tuple[int, ...], int | None]:
+        """Key of those that have the same cause: a curve of any order, a lens and its centre."""
+        return {"cubic": "quadratic", "lens_center": "lens"}.get(self.kind, self.kind), self.joints, self.view
 
 
 class _Extent(NamedTuple):
@@ -255,8 +261,7 @@ class _Tests:
         self.poses, starts = np.unique(pose_of[counted], return_index=True)
         self.edges = np.append(starts, counted.size)
         self.nuisances, self.dof = nuisances, max(solution.dof, 1)
-        self.pose, self.view = problem.detections.pose, problem.detections.view
-        self.numbers = problem.detections.numbers
+        self.detections = problem.detections
         # Weights of residuals in each view, and in the last entry in all: those of two views are near one.
         weights = [problem.detections.weight[v, u] for v, u in enumerate(used)]
         weights.append(problem.detections.weight[used])
@@ -398,20 +403,21 @@ class _Tests:
         self.choose(chosen)
         return chosen
 
-    def as_likely(self, choice: _Choice, chosen: Sequence[_Choice]) -> tuple[str, ...]:
-        """Codes of other nuisances that explain the images about as well as one of those chosen."""
+    def as_likely(self, choice: _Choice, chosen: Sequence[_Choice]) -> tuple[Finding, ...]:
+        """Other nuisances that explain the images about as well as one of those chosen."""
         self.choose([other for other in chosen if other != choice])
         candidates = self.candidates()
         self.choose(chosen)
         own = [criterion for criterion, other, _ in candidates if other.number == choice.number]
         near = [
-            _described(self, other.number, np.zeros(1), np.zeros((1, 1)), 0.0, None)
+            self.nuisances[other.number]
             for criterion, other, _ in candidates
             if own and criterion < own[0] + _UNDECIDED
         ]
-        named = {_limit(one): one.code for one in near[::-1]}
-        named.pop(_limit(_described(self, choice.number, np.zeros(1), np.zeros((1, 1)), 0.0, None)), None)
-        return tuple(named.values())[::-1][:_MAX_OTHERS]
+        named = {one.cause: one for one in near[::-1]}
+        named.pop(self.nuisances[choice.number].cause, None)
+        others = [_finding(one, self.detections, 0.0, 0.0, 0.0, None) for one in named.values()]
+        return tuple(others[::-1][:_MAX_OTHERS])
 
     def _best(self) -> _Choice | None:
         """Best candidate that is significant, or the one of fewer parameters that explains nearly as much."""
@@ -456,12 +462,12 @@ def _postures(q: FloatArray) -> IntArray:
 class ModelCheck:
     """Errors of predictions, and the deviations from the model that explain them."""
 
-    errors: tuple[ModelError, ...]  # tags that slipped, and those that dominate noise, largest effect first
+    errors: tuple[Finding, ...]  # tags that slipped, and those that dominate noise, largest effect first
     effect_px: float  # rms error per marker and view at other poses by all of them
     noise_px: float  # that by noise, with the correlation of the corners of a posture
     noise_factor: float  # noise_px over that of independent corners
     recorded_px: float  # rms error at the recorded poses
-    unshown: ModelError | None  # with the largest effect that the data could not have shown
+    unshown: Finding | None  # with the largest effect that the data could not have shown
     bias: FloatArray  # (p, errors) error of the parameters by each of them
 
     @property
@@ -493,7 +499,7 @@ def examine(
         change = [abs(lost[k:].mean() - lost[:k].mean()) for k in range(1, len(lost))]
         moved = stepped(solution, 1 + int(np.argmax(change)))
         if moved is not None:
-            slipped = [moved._replace(effect_px=slip_px)]
+            slipped = [replace(moved, effect_px=slip_px)]
         elif 2 * len(slipped) > np.unique(detections.marker // CORNERS).size:
             slipped, slip_px = [], 0.0
     total = float(np.hypot(total, slip_px))
@@ -529,11 +535,11 @@ def suspected(few: Solution) -> list[tuple[str, tuple[int, ...]]]:
     tests.choose(chosen)
     found += [one for _, one, _ in tests.candidates()]
     nuisances = [tests.nuisances[one.number] for one in found]
-    named = [(one.kind, tuple(int(tests.numbers[i]) for i in one.joints)) for one in nuisances]
+    named = [(one.kind, tuple(int(tests.detections.numbers[i]) for i in one.joints)) for one in nuisances]
     return list(dict.fromkeys(named))
 
 
-def stepped(solution: Solution, onset: int) -> ModelError | None:
+def stepped(solution: Solution, onset: int) -> Finding | None:
     """Return what moved at a pose, by its row, of a recording that no single fit describes, or None.
 
     The part in which all joints move more is fitted; a step explains the other's images as far as it can.
@@ -553,20 +559,18 @@ def stepped(solution: Solution, onset: int) -> ModelError | None:
         b = np.linalg.lstsq(Z, off)[0]
         if (square := float(np.square(off - Z @ b).sum())) < left:
             size = float(np.sqrt(np.mean((Z @ b / weight) ** 2)) if one.kind in _OF_IMAGES else -b[0])
-            joints = tuple(int(detections.numbers[i]) for i in one.joints)
-            view = "" if one.view is None else detections.view[one.view]
-            first, left = int(detections.pose[onset]), square
-            best = ModelError(one.kind, joints, view, size, 0.0, abs(size), first)
+            left = square
+            best = _finding(one, detections, size, 0.0, abs(size), int(detections.pose[onset]))
     return best
 
 
-def _slipped_tags(solution: Solution) -> tuple[list[ModelError], float]:
+def _slipped_tags(solution: Solution) -> tuple[list[Finding], float]:
     """Tags that moved on the tool: corners rejected from a pose on, or up to it; and the effect of all, px.
 
     A corner stays where most of its images show it. One that stays where it was before is off at the end, by
     as much as its rejected images; the effect is rms over all markers.
     """
-    problem, found, square = solution.problem, list[ModelError](), 0.0
+    problem, found, square = solution.problem, list[Finding](), 0.0
     detections, number = problem.detections, problem.detections.marker
     out = detections.seen & ~solution.used
     far = np.linalg.norm(solution.residual / detections.weight.clip(1e-300)[..., None], axis=2)
@@ -583,7 +587,8 @@ def _slipped_tags(solution: Solution) -> tuple[list[ModelError], float]:
         effect = off * float(np.sqrt(at_end / number.size))
         square += effect**2
         spread = off / float(np.sqrt(np.count_nonzero(rows)))
-        found.append(ModelError("tool", (), "", off, spread, effect, int(detections.pose[onset])))
+        moved = _Nuisance("tool", (), None, np.zeros(0), _STEP, int(tag))
+        found.append(_finding(moved, detections, off, spread, effect, int(detections.pose[onset])))
     return found, float(np.sqrt(square))
 
 
@@ -602,7 +607,7 @@ def _slip(detections: Detections, out: BoolArray, marker: int) -> tuple[int, boo
 
 def _estimated(
     tests: _Tests, effects: "_Effects", chosen: Sequence[_Choice]
-) -> tuple[list[ModelError], float, FloatArray]:
+) -> tuple[list[Finding], float, FloatArray]:
     """Amplitudes of nuisances together, with their effects; the effect of all, px; the bias of parameters."""
     if not chosen:
         return [], 0.0, np.zeros((len(tests.F), 0))
@@ -617,9 +622,9 @@ def _estimated(
     moved = [effects.of(one.number, part) @ b[at] for one, part, at in zip(chosen, parts, own, strict=True)]
     found = []
     for one, at, change in zip(chosen, own, moved, strict=True):
-        first = int(tests.pose[tests.poses[one.onset]]) if one.onset else None
+        first = int(tests.detections.pose[tests.poses[one.onset]]) if one.onset else None
         error = _described(tests, one.number, b[at], covariance[at, at], effects.rms(change), first)
-        found.append(error._replace(others=tests.as_likely(one, chosen)))
+        found.append(replace(error, others=tests.as_likely(one, chosen)))
     of_images = np.stack([part @ b[at] for part, at in zip(parts, own, strict=True)], axis=1)
     return found, effects.rms(np.sum(moved, axis=0)), tests.F @ (tests.U.T @ of_images)
 
@@ -641,7 +646,7 @@ class _Effects:
         """Root mean square per marker and view of a change (rows,)."""
         return float(np.sqrt(2.0 / max(len(change), 1)) * np.linalg.norm(change))
 
-    def unshown(self, found: set[int], sigma_px: float) -> ModelError | None:
+    def unshown(self, found: set[int], sigma_px: float) -> Finding | None:
         """Nuisance that has the largest effect of those too small for the tests and no larger than usual."""
         worst: tuple[float, int, FloatArray] | None = None
         for number, one in enumerate(self.tests.nuisances):
@@ -664,19 +669,35 @@ class _Effects:
 
 def _described(
     tests: _Tests, number: int, b: FloatArray, covariance: FloatArray, effect: float, first: int | None
-) -> ModelError:
-    """Record of a nuisance of amplitudes b (d,), in units of its usual size, with their covariance."""
+) -> Finding:
+    """Finding on a nuisance of amplitudes b (d,), in units of its usual size, with their covariance."""
     one, length = tests.nuisances[number], max(float(np.linalg.norm(b)), 1e-300)
     sign = -1.0 if (len(b) == 1 or one.kind == "scale") and (b < 0.0).all() else 1.0
     deviation = float(np.sqrt(max(float(b @ covariance @ b), 0.0))) / length
-    joints = tuple(int(tests.numbers[i]) for i in one.joints)
-    view = "" if one.view is None else tests.view[one.view]
     size = _SIZES[one.kind]
     if one.kind == "scale":  # of several joints the root mean square
-        size /= np.sqrt(len(joints))
+        size /= np.sqrt(len(one.joints))
     if one.kind in _OF_IMAGES:  # px as seen
         size /= tests.weight[-1 if one.view is None else one.view]
-    return ModelError(one.kind, joints, view, sign * size * length, size * deviation, effect, first)
+    return _finding(one, tests.detections, sign * size * length, size * deviation, effect, first)
+
+
+def _finding(
+    one: _Nuisance, detections: Detections, size: float, deviation: float, effect: float, first: int | None
+) -> Finding:
+    """Finding on a nuisance: its size, a share, rad (prismatic × 0.3 m/rad) or px, and its effect, px."""
+    unit, factor = ("px" if one.kind in _OF_IMAGES else "1"), 1.0
+    if one.joints and one.kind not in ("scale", "coupling"):
+        i = one.joints[-1]
+        unit, factor = detections.units[i], float(per_rad(detections.prismatic)[i])
+    subject = Subject(
+        joints=tuple(int(detections.numbers[i]) for i in one.joints),
+        views=() if one.view is None else (detections.view[one.view],),
+        tag=one.tag,
+        poses=() if first is None else (first,),
+    )
+    sizes = factor * size, factor * deviation
+    return Finding(one.kind, LIMITS, subject, *sizes, unit=unit, effect_px=effect)
 
 
 def _design(tests: _Tests, r: FloatArray, T: FloatArray, sigma_px: float) -> float:
@@ -697,67 +718,3 @@ def _design(tests: _Tests, r: FloatArray, T: FloatArray, sigma_px: float) -> flo
     e = np.array(expected)
     ratio, noise = sum(shown) / max(e.sum(), 1e-300), np.sqrt(2.0 * (e**2).sum()) / max(e.sum(), 1e-300)
     return float(ratio) if ratio > 1.0 + _CORRELATED * noise else 1.0
-
-
-# Words for each kind: the limit of a fit, and a sentence on it.
-_WORDS = {
-    "scale": ("gear of {joints}", "{joints} {turn} {share} {more} than {read}"),
-    "quadratic": (
-        "curve of {joints}",
-        "readings of {joints} follow a curve, off by {size} at the ends",
-    ),
-    "cubic": ("curve of {joints}", "readings of {joints} follow a curve, off by {size} at the ends"),
-    "harmonic": ("eccentric encoder of {joints}", "readings of {joints} swing by {size} once a turn"),
-    "coupling": ("coupling of {joints}", "joint {0} turns joint {1} by {share} of its motion"),
-    "sag": ("sag of {joints}", "{joints} sags under load, by up to {size}"),
-    "joint_drift": ("drift of {joints}", "the zero of {joints} drifts by {size} over the recording"),
-    "joint_step": ("step of {joints}", "the zero of {joints} jumps by {size}{first}"),
-    "camera_drift": ("drift of the {view} camera", "the {view} camera drifts, by {size} over the recording"),
-    "camera_step": ("motion of the {view} camera", "the {view} camera moved{first}, by {size}"),
-    "base": (
-        "motion of the base or the cameras",
-        "the base of the arm or all cameras moved{first}, by {size}",
-    ),
-    "tool": ("markers that moved on the tool", "the markers moved on the tool{first}, by {size}"),
-    "lens": ("lens of the {view} camera", "the lens of the {view} camera distorts, by {size}"),
-    "lens_center": ("lens of the {view} camera", "the {view} lens is decentred, by {size}"),
-    "focus": ("focus of the {view} camera", "the {view} image is scaled with depth, by {size}"),
-}
-
-
-def describe(error: ModelError, prismatic: BoolArray) -> tuple[str, str]:
-    """Describe a deviation from the model: what limits a fit, and a sentence on it with its deviation."""
-    i = error.joints[-1] - 1 if error.joints else 0
-    slides, spread = bool(error.joints and prismatic[i]), error.deviation
-    if error.kind in _OF_IMAGES:
-        factor, unit = 1.0, " px"
-    elif error.kind in ("scale", "coupling"):
-        factor, unit = 100.0, " %"
-    else:
-        factor, unit = (
-            (1e3 * float(per_rad(prismatic)[i]), " mm") if slides else (float(np.degrees(1.0)), "°")
-        )
-    size = f"{factor * abs(error.estimate):.2g}{unit}" + (f" ± {factor * spread:.1g}{unit}" if spread else "")
-    several, names = len(error.joints) > 1, _names(error)
-    more = "less" if error.estimate < 0.0 else "more or less" if several else "more"
-    turn = ("move" if slides else "turn") + "s" * (not several)
-    words = {"joints": names, "view": error.view, "size": size, "share": size, "more": more, "turn": turn}
-    words |= {"read": "they read" if several else "it reads"}
-    words |= {"first": "" if error.first is None else f" at pose {error.first}"}
-    sentence = _WORDS[error.kind][1].format(*error.joints, **words)
-    if error.others:
-        others = [_limit(ModelError.of(code, [0.0, 0.0, 0.0, np.nan])) for code in error.others]
-        sentence += f" (or {', or '.join(others)}: the images do not tell)"
-    return _limit(error), sentence
-
-
-def _names(error: ModelError) -> str:
-    """Name the joints of a deviation."""
-    if len(error.joints) > 1 and error.kind == "scale":
-        return "all joints"
-    return f"joint{'s' * (len(error.joints) > 1)} {' and '.join(map(str, error.joints))}"
-
-
-def _limit(error: ModelError) -> str:
-    """Name a deviation as the limit of a fit."""
-    return _WORDS[error.kind][0].format(*error.joints, joints=_names(error), view=error.view)

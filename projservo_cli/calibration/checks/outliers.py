@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import reduce
 
@@ -16,6 +17,7 @@ from projservo_cli.calibration.epipolar import OUTLIER
 from projservo_cli.calibration.initialization import stationary
 from projservo_cli.calibration.prediction import Parameters
 from projservo_cli.calibration.robust_fit import Solution, median_px
+from projservo_cli.findings import LIMITS, Finding, Subject
 from projservo_cli.records import BoolArray, FloatArray, IntArray
 
 # Median residual, in σ, below which a corrected joint reading explains a pose.
@@ -34,8 +36,6 @@ _SMALL_MOTION = 0.1
 _SETTLES, _LATER = 2, 10
 # Standard deviations of chance above which further poses belong to the settling of a camera.
 _SETTLED = 2.5
-# Maximum number of runs of poses that a message names.
-_MAX_RUNS = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,20 +143,20 @@ def _settling(
     return [k for k, rows in zip(poses[:last].tolist(), at, strict=False) if rows.any()]
 
 
-def describe_moved(detections: Detections, moved: IntArray) -> str:
-    """Describe images (V, 2) of cameras that moved, by runs of poses in the order of the recording."""
-    present, sentences = np.unique(detections.pose_of), []
+def moved_images(detections: Detections, moved: IntArray) -> Iterator[Finding]:
+    """Findings on images (N, 2) of cameras that moved or settled, by the ends of runs of poses."""
+    present = np.unique(detections.pose_of)
     for view, name in enumerate(detections.view):
         at = np.searchsorted(present, np.sort(moved[moved[:, 1] == view, 0]))
         if not at.size:
             continue
         runs = np.split(at, np.flatnonzero(np.diff(at) > 1) + 1)
-        words = [" to ".join(map(str, np.unique(detections.pose[present[run[[0, -1]]]]))) for run in runs]
-        settled = f"settled over poses {words.pop(0)}" if at[0] == 0 and runs[0].size > 1 else ""
-        more = f" and {len(words) - _MAX_RUNS} more" if len(words) > _MAX_RUNS else ""
-        later = f"moved at pose{'s' * (at.size > 1)} {', '.join(words[:_MAX_RUNS])}{more}" if words else ""
-        sentences.append(f"the {name} camera {' and '.join(filter(None, (settled, later)))}")
-    return ", ".join(sentences)
+        ends = [int(end) for run in runs for end in detections.pose[present[run[[0, -1]]]]]
+        if at[0] == 0 and runs[0].size > 1:
+            yield Finding("unsettled_camera", LIMITS, Subject(views=(name,), poses=tuple(ends[:2])))
+            ends = ends[2:]
+        if ends:
+            yield Finding("moved_camera", LIMITS, Subject(views=(name,), poses=tuple(ends)))
 
 
 def _id_switches(

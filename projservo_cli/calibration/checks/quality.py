@@ -1,29 +1,31 @@
-"""Quality of a calibration: observability of joints, the verdict in words, and cross-validation."""
+"""Quality of a calibration: observability of joints, errors of predictions, and findings."""
 
-import dataclasses
-from dataclasses import dataclass
-from typing import NamedTuple
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import bdtrc
 
 from projservo_cli.calibration.bundle_adjustment import LeastSquares
-from projservo_cli.calibration.checks.model_error import ModelCheck, describe, examine
+from projservo_cli.calibration.checks.model_error import ModelCheck, examine
 from projservo_cli.calibration.detections import (
     MAX_JUDGED,
     MAX_REACHES,
     REACH_M,
     REACH_RAD,
     Detections,
-    describe_joints,
     even_choice,
     require_motion,
     require_moved,
+    weak_joints,
 )
 from projservo_cli.calibration.joint_noise import quantile
 from projservo_cli.calibration.prediction import Parameters
 from projservo_cli.calibration.robust_fit import Expected, Solution
+from projservo_cli.findings import LIMITS, NOTE, REFUSES, Finding, Subject
 from projservo_cli.records import BoolArray, Errors, FloatArray, IntArray, WorkFailed, apart
+from projservo_cli.words import line
 
 # Noise of predictions at the reach, in units of the pixel noise, above which a joint is undetermined.
 UNDETERMINED_NOISE = 1000.0
@@ -47,8 +49,6 @@ _FRAMES = 8
 _MIN_REACHES = 0.01
 # Number of bisections of the logarithm of that range, to a twentieth.
 _BISECTIONS = 7
-# Maximum number of deviations from the model that advice names.
-_MAX_NAMED = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +75,7 @@ class _Uncertainty:
 
     def in_region(self, q: FloatArray) -> BoolArray:
         """Mask (V, K, m) of images at poses (K, n) in the region."""
-        some = dataclasses.replace(self.params, M=self.params.M[self.which])
+        some = replace(self.params, M=self.params.M[self.which])
         pixels = some.predict(q - self.problem.q_reference).swapaxes(0, 1)
         low, high = self.region[:, :, None, None]
         return np.asarray(((pixels >= low) & (pixels <= high)).all(axis=-1))
@@ -198,18 +198,14 @@ def check_model(solution: Solution, errors: Errors, sigma_px: float) -> ModelChe
 
 @dataclass(frozen=True, eq=False)
 class _Assessment:
-    """Excitation and noise of each joint, and whether the calibration is usable."""
+    """Excitation and noise of each joint, and the findings on a calibration."""
 
     span: FloatArray  # (n,) range in the data, rad or m
     noise: FloatArray  # (n,) noise of images at the reach, in units of the pixel noise; NaN if unknown
     # expected error of images at random poses and its 99th percentile, px; None if unknown
     error: tuple[float, float] | None
     check: ModelCheck | None  # deviations from the model; None if it is exact, as in a simulation
-    usable: bool
-    reason: str  # why it is usable or not, and its limiting factor
-    advice: tuple[str, ...]  # next steps, first about the limiting factor
-    limit: str  # its limiting factor
-    notes: tuple[str, ...]  # advice that noise alone gives, with nothing to mend
+    findings: tuple[Finding, ...]  # its residuals first, then what limits it, the most important first
 
 
 def assess(
@@ -218,7 +214,7 @@ def assess(
     expected: Expected,
     outlier: IntArray,
     rejected: tuple[int, int],
-    suspicion: str,
+    suspicion: Finding,
     max_predicted_px: float = np.inf,
 ) -> _Assessment:
     """Assess a fit.
@@ -230,125 +226,119 @@ def assess(
     max_predicted_px : effect of deviations from the model on predictions above which it is not usable.
     Raises WorkFailed naming a joint that moves no image, or whose operator is not determined.
     """
-    prismatic, numbers = solution.params.prismatic, solution.problem.detections.numbers
     # Residuals of a method without covariance are its own errors, not noise of the images.
     sigma = expected.sigma_px if errors is None else expected.noise_px(solution)
     span = _require_joints_seen(solution, sigma)
-    noise, error, check = np.full(len(span), np.nan), None, None
-    weak = np.zeros(len(span), dtype=np.bool_)  # by the joints in the data, whatever their noise
-    advice: list[str] = []
-    if errors is not None:
-        uncertainty = _Uncertainty.of(solution, errors)
-        spreads = uncertainty.at_reach()
-        noise = np.array([_rms(T) for T in spreads])
-        typical, bound = _predicted_error(uncertainty.within_ranges().T)
-        error = (sigma * typical, sigma * bound)
-        if not expected.known:
-            check = check_model(solution, errors, sigma)
-            factor, effect = check.noise_factor, check.effect_px
-            error = (float(np.hypot(factor * error[0], effect)), float(np.hypot(factor * error[1], effect)))
-        needed = _needed_spans(uncertainty, spreads)
-        i = int(np.argmax(noise))
-        if noise[i] > UNDETERMINED_NOISE:
-            raise WorkFailed(
-                f"joint {numbers[i]} is not determined: near the reference its predicted images err by "
-                f"{noise[i]:.3g} times the pixel noise; "
-                + "".join(describe_joints(np.array([i]), span, prismatic, needed, numbers))
-            )
-        weak = noise > WEAK_NOISE
-        if weak.any() and solution.problem.tau is not None:
-            exact = dataclasses.replace(solution, problem=solution.problem.with_noise(None))
-            weak &= (
-                np.array([_rms(T) for T in _Uncertainty.of(exact, exact.errors()).at_reach()]) > WEAK_NOISE
-            )
-        alone = _span_alone(solution.problem.detections)
-        advice += describe_joints(np.flatnonzero(weak), span, prismatic, needed, numbers, alone)
-    warned, share = expected.warns(solution), expected.ratio(solution)
-    found = f"{solution.sigma_px:.3g} px a coordinate"
-    wanted = f"the {expected.sigma_px:.3g} px {expected.origin}"
-    if errors is None and warned:
-        # A method for comparison returns its result all the same.
-        short = f"the closed_form method explains the images only to {found}"
-        reason = f"{short}, {share:.3g} times {wanted}: use bundle_adjustment"
-        return _Assessment(span, noise, error, None, False, reason, (), "the method", ())
-    reason, notes = f"residuals of {found} agree with {wanted}", list[str]()
-    if warned:
-        reason = f"more than pixel noise is left: residuals of {found} are {share:.3g} times {wanted}"
-        if "joint readings" in suspicion and not (check and check.errors):
-            notes.append("look for joint readings that lag behind the images")
-            advice[:0] = notes
-    suspects, swaps = rejected
-    outliers, observations = len(outlier), solution.used.shape[1]
-    limit, many = "noise", outliers > _MAX_OUTLIERS * observations
-    alike = _describe_shared(outlier, solution.problem.detections)
-    what = "1 observation was rejected as an outlier"
-    if outliers != 1:
-        what = f"{outliers} observations were rejected as outliers"
-    outlier_advice = f"{what}{alike}: check the detection of markers"
-    if many:
-        advice.append(outlier_advice)
-    if words := _describe_joint_noise(solution):
-        reason = f"{reason}, with joint readings off by {words}"
-        over, moved_px = solution.joint_effect()
-        if over > 1.0:
-            moved = f"move images by {moved_px:.3g} px"
-            limit = f"joint readings, which {moved}"
-            finer = (
-                f"errors of joint readings {moved}, more than pixel noise: finer or stiffer joints would help"
-            )
-            advice.append(finer)
-            notes.append(finer)
-    of_outliers = f"outliers: {outliers} of {observations}{alike}"
-    if warned or suspicion == "lens":
-        limit = of_outliers if suspicion == "outliers" else suspicion
-    elif weak.any():
-        few = span[weak] < np.where(prismatic[weak], REACH_M, REACH_RAD)
-        limit = "amplitude" if few.any() else "geometry"
-    elif many or alike:
-        limit = of_outliers
-    usable = True
-    if check is not None and check.errors:
-        sentences = [describe(one, prismatic) for one in check.errors]
-        if check.effect_px > 0.0:
-            limit = f"{sentences[0][0]}, which moves predictions by {check.effect_px:.3g} px"
-        advice[:0] = [sentence for _, sentence in sentences[:_MAX_NAMED]]
-        if check.effect_px > max_predicted_px:
-            usable = False
-            limit += f", more than calibration.max_predicted_px = {max_predicted_px:.3g}"
+    noise, warned = np.full(len(span), np.nan), expected.warns(solution)
+    if errors is None:
+        code, severity = ("closed_form", REFUSES) if warned else ("noise", NOTE)
+        return _Assessment(span, noise, None, None, (expected.finding(code, severity, solution),))
+    noise, error, weak = _noise_of_joints(solution, errors, sigma)
+    check = None
+    if not expected.known:
+        check = check_model(solution, errors, sigma)
+        factor, effect = check.noise_factor, check.effect_px
+        error = (float(np.hypot(factor * error[0], effect)), float(np.hypot(factor * error[1], effect)))
+    found = [
+        expected.finding("residuals", LIMITS, solution)
+        if warned
+        else expected.finding("noise", NOTE, solution)
+    ]
+    if check is not None:
+        found += _deviations(check, max_predicted_px)
+    lags = suspicion.code == "lagging_joints" and warned and not (check and check.errors)
+    found += [suspicion] if lags or suspicion.code == "unmodelled_lens" else []
+    found += [*weak, *_left_out(solution, outlier, rejected, warned and suspicion.code == "outliers")]
+    found += _joint_noise(solution)
+    notes_last = sorted(found[1:], key=lambda one: one.severity == NOTE)
+    return _Assessment(span, noise, error, check, (found[0], *notes_last))
+
+
+def _noise_of_joints(
+    solution: Solution, errors: Errors, sigma: float
+) -> tuple[FloatArray, tuple[float, float], list[Finding]]:
+    """Noise (n,) of the joints, expected errors of images, px, and joints that are hardly determined."""
+    detections = solution.problem.detections
+    uncertainty, span = _Uncertainty.of(solution, errors), require_motion(detections)
+    spreads = uncertainty.at_reach()
+    noise = np.array([_rms(T) for T in spreads])
+    typical, bound = _predicted_error(uncertainty.within_ranges().T)
+    needed = _needed_spans(uncertainty, spreads)
+    i = int(np.argmax(noise))
+    if noise[i] > UNDETERMINED_NOISE:
+        (why,) = weak_joints(np.array([i]), span, needed, detections, np.zeros(len(span)))
+        raise WorkFailed(
+            f"joint {detections.numbers[i]} is not determined: near the reference its predicted images err "
+            f"by {noise[i]:.3g} times the pixel noise; {line(why, detections.setup)}",
+            findings=[replace(why, severity=REFUSES)],
+        )
+    weak = noise > WEAK_NOISE
+    if weak.any() and solution.problem.tau is not None:  # by the joints in the data, whatever their noise
+        exact = replace(solution, problem=solution.problem.with_noise(None))
+        weak &= np.array([_rms(T) for T in _Uncertainty.of(exact, exact.errors()).at_reach()]) > WEAK_NOISE
+    found = weak_joints(np.flatnonzero(weak), span, needed, detections, _span_alone(detections))
+    return noise, (sigma * typical, sigma * bound), found
+
+
+def _deviations(check: ModelCheck, max_predicted_px: float) -> list[Finding]:
+    """Deviations from the model, which refuse a calibration if they move predictions too far together."""
+    found, effect = list(check.errors), check.effect_px
+    refuses = bool(found) and effect > max_predicted_px
+    if refuses:
+        found[0] = replace(found[0], severity=REFUSES, limit=max_predicted_px)
+    if len(found) > 1:
+        severity = REFUSES if refuses else NOTE
+        found.append(Finding("deviations", severity, limit=max_predicted_px, unit="px", effect_px=effect))
+    if check.unshown is not None:
+        found.append(Finding("unshown", NOTE, effect_px=check.unshown.effect_px, others=(check.unshown,)))
+    return found
+
+
+def _left_out(
+    solution: Solution, outlier: IntArray, rejected: tuple[int, int], suspected: bool
+) -> Iterator[Finding]:
+    """Observations, joint readings and numbers that were left out, or read otherwise.
+
+    suspected : whether observations that are left out are the likely cause of residuals beyond noise.
+    """
+    observations, (suspects, swaps) = solution.used.shape[1], rejected
+    if len(outlier):
+        alike = _shared(outlier, solution.problem.detections)
+        limits = suspected or alike or len(outlier) > _MAX_OUTLIERS * observations
+        severity = LIMITS if limits else NOTE
+        yield Finding("outliers", severity, amount=len(outlier), limit=observations, unit="1", others=alike)
     if suspects:
-        what = "1 joint reading disagrees" if suspects == 1 else f"{suspects} joint readings disagree"
-        advice.append(f"{what} with the images: check how poses and images are paired")
+        yield Finding("suspect_readings", LIMITS, amount=suspects, unit="1")
     if swaps:
-        times = f"{swaps} times" if swaps > 1 else "once"
-        advice.append(f"{times} a marker was seen under the number of another: check the numbering")
-    if outliers and not many:
-        advice.append(outlier_advice)
-    if outliers and not (many and limit == of_outliers):
-        notes.append(outlier_advice)
-    reason = f"{reason}; limited by {limit}"
-    return _Assessment(span, noise, error, check, usable, reason, tuple(advice), limit, tuple(notes))
+        yield Finding("id_switches", LIMITS, amount=swaps, unit="1")
 
 
-def _describe_shared(outlier: IntArray, detections: Detections) -> str:
-    """Name the marker, pose or view of most outliers (L, 3), if that is no chance; empty otherwise."""
+def _shared(outlier: IntArray, detections: Detections) -> tuple[Finding, ...]:
+    """Marker, pose or view of most outliers (L, 3), if that is no chance."""
     V = len(detections.view)
-    several = ((1, "marker", detections.marker.size), (0, "pose", detections.pose.size), (2, "view", V))
+    several = ((1, "markers", detections.marker.size), (0, "poses", detections.pose.size), (2, "views", V))
     for column, kind, count in several:
         values, counts = np.unique(outlier[:, column], return_counts=True)
         most = int(counts.max(initial=0))
         if 2 * most > len(outlier) and bdtrc(most - 1, len(outlier), 1.0 / count) < _CHANCE:
             value = int(values[np.argmax(counts)])
-            name = (*detections.view, "all")[value] if kind == "view" else value
-            return f", {'all' if most == len(outlier) else most} of {kind} {name}"
-    return ""
+            name: Any = (*detections.view, "all")[value] if kind == "views" else value
+            of_kind: dict[str, Any] = {kind: (name,)}
+            return (Finding("outliers", LIMITS, Subject(**of_kind), most, limit=len(outlier), unit="1"),)
+    return ()
 
 
-def _describe_joint_noise(solution: Solution) -> str:
-    """Describe the noise of joint readings; empty if the images show none."""
+def _joint_noise(solution: Solution) -> Iterator[Finding]:
+    """Noise of joint readings, if the images show any, and whether it is more than that of pixels."""
     noise = solution.joint_noise
     if noise is None or noise.sigma_q == 0.0:
-        return ""
-    return f"{np.degrees(noise.sigma_q):.2g}° rms" + (" (ticks that were counted)" if noise.ticks else "")
+        return
+    over, moved_px = solution.joint_effect()
+    subject = Subject(name="ticks" if noise.ticks else "")
+    found = Finding("joint_noise", NOTE, subject, noise.sigma_q, unit="rad", effect_px=moved_px)
+    if over > 1.0:
+        yield replace(found, code="coarse_joints", severity=LIMITS)
+    yield found
 
 
 def _require_joints_seen(solution: Solution, sigma_px: float) -> FloatArray:
@@ -359,7 +349,5 @@ def _require_joints_seen(solution: Solution, sigma_px: float) -> FloatArray:
     rate = there.joint_derivative(solution.params)
     motion = np.linalg.norm(rate, axis=2).mean(axis=(0, 1)) * span
     i = int(np.argmin(motion))
-    require_moved(
-        int(detections.numbers[i]), float(span[i]), bool(detections.prismatic[i]), float(motion[i]), sigma_px
-    )
+    require_moved(int(detections.numbers[i]), float(span[i]), detections.units[i], float(motion[i]), sigma_px)
     return span

@@ -3,11 +3,12 @@
 import dataclasses
 from collections.abc import Sequence
 from itertools import islice
+from typing import Any
 
 import numpy as np
 
 from projservo_cli.calibration.bundle_adjustment import LeastSquares, minimize
-from projservo_cli.calibration.checks.model_error import describe, stepped
+from projservo_cli.calibration.checks.model_error import stepped
 from projservo_cli.calibration.checks.outliers import MAX_OF_POSE, Outliers, fits_other_joints
 from projservo_cli.calibration.checks.quality import check_model
 from projservo_cli.calibration.checks.validation import cross_validate
@@ -16,6 +17,7 @@ from projservo_cli.calibration.epipolar import ImageGeometry
 from projservo_cli.calibration.initialization import Search, starting_markers, starts
 from projservo_cli.calibration.lens_estimation import undistorted
 from projservo_cli.calibration.robust_fit import Expected, Solution, fit_from
+from projservo_cli.findings import REFUSES, Finding, Subject
 from projservo_cli.records import TOOL, WORLD, BoolArray, FloatArray, WorkFailed, letters_of
 
 # Maximum fitted over expected noise of a fit that rejects much, as wrong detections hide in the residuals.
@@ -76,20 +78,17 @@ def _doubtful_observations(solution: Solution, found: Outliers, epipolar: ImageG
     return np.asarray(out & (share >= _MIN_OF_POSE)[at])
 
 
-def describe_unexplained(solution: Solution, found: Outliers, epipolar: ImageGeometry) -> str:
-    """Describe rejected observations that both views agree on, which contradict a fit; else empty."""
+def unexplained(solution: Solution, found: Outliers, epipolar: ImageGeometry) -> Finding | None:
+    """Find rejected observations that both views agree on, which contradict a fit."""
     total = int(solution.problem.detections.both.sum())
     count = int(_doubtful_observations(solution, found, epipolar).sum())
     if count <= max(3.0, _MAX_UNEXPLAINED * total):
-        return ""
-    return (
-        f"in {count} of {total} observations both cameras agree with each other but not with the robot; "
-        "check the joint readings and types (R or P)"
-    )
+        return None
+    return Finding("cameras_agree", REFUSES, amount=count, limit=total, unit="1")
 
 
-def describe_other_motion(solution: Solution, found: Outliers, epipolar: ImageGeometry) -> str:
-    """Describe a motion other than the joint readings that rejected observations agree on; else empty.
+def other_motion(solution: Solution, found: Outliers, epipolar: ImageGeometry) -> Finding | None:
+    """Find a motion other than the joint readings that rejected observations agree on.
 
     It takes observations that both views agree on, at poses of which the rest is kept. Corners of an image
     share errors, so it takes a large share of the poses too.
@@ -106,11 +105,9 @@ def describe_other_motion(solution: Solution, found: Outliers, epipolar: ImageGe
             count, poses = count + rows.size, poses + 1
     seen = np.unique(problem.detections.pose_of).size
     if count <= max(3.0, _MAX_UNEXPLAINED * total) or poses <= _MANY_POSES * seen:
-        return ""
-    return (
-        f"{count} of {total} observations, at {poses} of {seen} poses, show other joints than those read; "
-        "check how poses and images are paired, and the joint readings and types (R or P)"
-    )
+        return None
+    at = Finding("other_joints", REFUSES, amount=poses, limit=seen, unit="1")
+    return Finding("other_joints", REFUSES, amount=count, limit=total, unit="1", others=(at,))
 
 
 def straight_joints(solution: Solution) -> list[int]:
@@ -135,8 +132,8 @@ def straight_joints(solution: Solution) -> list[int]:
     return [int(i) for i in np.flatnonzero(found)]
 
 
-def joint_at_fault(search: Search, max_px: float, straight: Sequence[int] | None = None) -> str:
-    """Describe the one change, of a joint or of the order of images, with which the model fits, or "".
+def joint_at_fault(search: Search, max_px: float, straight: Sequence[int] | None = None) -> Finding | None:
+    """Find the one change, of a joint or of the order of images, with which the model fits.
 
     A rough fit compares all changes. The best are fitted completely and accepted only if the fit passes as a
     calibration does, with a noise of at most ``max_px``.
@@ -150,7 +147,7 @@ def joint_at_fault(search: Search, max_px: float, straight: Sequence[int] | None
         changes = [changes[_ORDERS + i] for i in straight]
     candidates = []
     try:
-        for done, (words, changed, handicap) in enumerate(changes):
+        for done, (cause, changed, handicap) in enumerate(changes):
             search.progress("calibration, joint at fault", done, len(changes))
             seen = changed.detections.seen
             for start in islice(starts(dataclasses.replace(search, problem=changed), changed.detections), 1):
@@ -159,88 +156,88 @@ def joint_at_fault(search: Search, max_px: float, straight: Sequence[int] | None
                 ).params
                 # In logarithms neither a few gross errors nor many small ones outweigh the rest.
                 level = np.mean(np.log(np.linalg.norm(changed.residual(params)[seen], axis=1) + 1e-9))
-                candidates.append((float(level) + handicap, words, changed, params))
+                candidates.append((float(level) + handicap, cause, changed, params))
     except WorkFailed:
-        return ""
+        return None
     candidates.sort(key=lambda candidate: candidate[0])
-    for _, words, changed, params in candidates[:_FOLLOWED]:
+    for _, cause, changed, params in candidates[:_FOLLOWED]:
         found = fit_from(changed, params, search.epipolar)
         if found is None or found.sigma_px > max_px:
             continue
-        if not describe_unexplained(found, Outliers.empty(changed.detections), search.epipolar):
-            return words
-    return ""
+        if unexplained(found, Outliers.empty(changed.detections), search.epipolar) is None:
+            return cause
+    return None
 
 
-def _hypotheses(detections: Detections, q_reference: FloatArray) -> list[tuple[str, LeastSquares, float]]:
+def _hypotheses(detections: Detections, q_reference: FloatArray) -> list[tuple[Finding, LeastSquares, float]]:
     """Hypotheses that a joint is of the other type or stands still, or of late images; with a penalty."""
-    found, q, numbers = [], detections.q, detections.numbers
-    for order, shifted, remedy in (
-        ("before", np.vstack([q[:1], q[:-1]]), "let each pose settle for longer (plant.settle_s)"),
-        ("after", np.vstack([q[1:], q[-1:]]), "store readings with the image of the same pose"),
-    ):
-        words = f"each image shows the pose {order} its reading: {remedy}, and take the newest frame"
-        found.append((words, LeastSquares.of(dataclasses.replace(detections, q=shifted), q_reference), 0.0))
-    other, there = (TOOL, "on the tool") if detections.mount == WORLD else (WORLD, "fixed")
-    backwards = dataclasses.replace(
-        detections, q=np.ascontiguousarray(-q[:, ::-1]), prismatic=detections.prismatic[::-1], mount=other
-    )
-    words = f"by the images the cameras are {there}: give --mount {other} (data.mount)"
-    found.insert(0, (words, LeastSquares.of(backwards, -q_reference[::-1]), 0.0))
+    found = list[tuple[Finding, LeastSquares, float]]()
+    q, numbers = detections.q, detections.numbers
+
+    def add(
+        code: str, subject: Subject, unit: str = "", q_0: FloatArray = q_reference, **changed: Any
+    ) -> None:
+        """Add a hypothesis, which changes fields of the detections."""
+        problem = LeastSquares.of(dataclasses.replace(detections, **changed), q_0)
+        finding = Finding(code, REFUSES, subject, unit=unit)
+        found.append((finding, problem, _SIMPLER if code == "joint_type" else 0.0))
+
+    backwards: dict[str, Any] = {
+        "q": np.ascontiguousarray(-q[:, ::-1]),
+        "prismatic": detections.prismatic[::-1],
+    }
+    other = TOOL if detections.mount == WORLD else WORLD
+    add("other_mount", Subject(name=other), q_0=-q_reference[::-1], mount=other, **backwards)
+    add("images_before_readings", Subject(), q=np.vstack([q[:1], q[:-1]]))
+    add("images_after_readings", Subject(), q=np.vstack([q[1:], q[-1:]]))
     for i, slides in enumerate(detections.prismatic):
         flipped = detections.prismatic.copy()
         flipped[i] = not slides
-        given, fits = ("prismatic", "revolute") if slides else ("revolute", "prismatic")
-        letters = letters_of(flipped[numbers.argsort()])
-        remedy = f"check the types of joints, --joints or joint_types ({letters} would fit)"
-        words = f"by the images joint {numbers[i]} is {fits}, not {given}: {remedy}"
-        turned = dataclasses.replace(detections, prismatic=flipped)
-        found.append((words, LeastSquares.of(turned, q_reference), _SIMPLER))
+        subject = Subject(joints=(int(numbers[i]),), name=letters_of(flipped[numbers.argsort()]))
+        add("joint_type", subject, "rad" if slides else "m", prismatic=flipped)
     for i in range(len(q_reference) if len(q_reference) > 1 else 0):
-        still = f"by the images joint {numbers[i]} stands still while its readings move"
-        words = f"{still}: check that they are its own"
-        fewer = dataclasses.replace(
-            detections, q=np.delete(detections.q, i, axis=1), prismatic=np.delete(detections.prismatic, i)
-        )
-        found.append((words, LeastSquares.of(fewer, np.delete(q_reference, i)), 0.0))
+        fewer: dict[str, Any] = {
+            "q": np.delete(q, i, axis=1),
+            "prismatic": np.delete(detections.prismatic, i),
+        }
+        subject = Subject(joints=(int(numbers[i]),))
+        add("standing_joint", subject, q_0=np.delete(q_reference, i), **fewer)
     return found
 
 
-def describe_deviation(solution: Solution, expected: Expected) -> str:
-    """Describe the deviation from the model that explains most of a fit that is refused; else empty."""
+def deviation(solution: Solution, expected: Expected) -> Finding | None:
+    """Find the deviation from the model that explains most of a fit that is refused."""
     if expected.known or solution.dof <= 0:
-        return ""
-    errors = check_model(solution, solution.errors(), expected.noise_px(solution)).errors
-    onset, prismatic = (
-        _change(_rejected_views(solution), solution.problem.detections.view)[0],
-        solution.params.prismatic,
+        return None
+    errors, detections = (
+        check_model(solution, solution.errors(), expected.noise_px(solution)).errors,
+        solution.problem.detections,
     )
-    if not onset and errors and errors[0].first is not None:
-        onset = int(np.argmax(solution.problem.detections.pose == errors[0].first))
-    found = (stepped(solution, onset) if onset else None) or next(iter(errors), None)
-    return "" if found is None else f"the residuals look as if {describe(found, prismatic)[1]}"
+    onset = _change(_rejected_views(solution), detections.view)[0]
+    if not onset and errors and errors[0].subject.poses:
+        onset = int(np.argmax(detections.pose == errors[0].subject.poses[0]))
+    return (stepped(solution, onset) if onset else None) or next(iter(errors), None)
 
 
-def refusal(solution: Solution, expected: Expected) -> str | None:
-    """Return the reason why a fit must not pass, or None: its noise, or the poses that it rejects."""
+def refusal(solution: Solution, expected: Expected) -> Finding | None:
+    """Return the finding by which a fit must not pass, or None: its noise, or the poses that it rejects."""
     if (of_noise := expected.refusal(solution)) is not None:
         return of_noise
     rejected = _rejected_views(solution)
     names = solution.problem.detections.view
-    return _change(rejected, names)[1] or _describe_order(solution, rejected) or _describe_unmoved(solution)
+    return _change(rejected, names)[1] or _wrong_order(solution, rejected) or _unmoved(solution)
 
 
-def _describe_unmoved(solution: Solution) -> str | None:
-    """Describe a joint whose motion is mostly rejected, as with a wrong type or wrong readings, or None."""
+def _unmoved(solution: Solution) -> Finding | None:
+    """Find a joint whose motion is mostly rejected, as with a wrong type or wrong readings, or None."""
     detections = solution.problem.detections
     kept = np.unique(detections.pose_of[solution.used.any(axis=0)])
     square = (detections.q - detections.q.mean(axis=0)) ** 2
     short = square[kept].sum(axis=0) < _KEPT * square.sum(axis=0)
     if not short.any():
         return None
-    i = int(np.argmax(short))
-    number = detections.numbers[i]
-    return f"the fit rejects most motion of joint {number}; check its readings and its type (R or P)"
+    subject = Subject(joints=(int(detections.numbers[np.argmax(short)]),))
+    return Finding("rejected_motion", REFUSES, subject)
 
 
 def _rejected_views(solution: Solution) -> BoolArray:
@@ -254,28 +251,25 @@ def _rejected_views(solution: Solution) -> BoolArray:
     return np.asarray(used < _KEPT * seen)
 
 
-def _change(rejected: BoolArray, names: Sequence[str]) -> tuple[int, str]:
-    """Row from or up to which poses are nearly all rejected, and a sentence on it; 0 and none without.
+def _change(rejected: BoolArray, names: Sequence[str]) -> tuple[int, Finding | None]:
+    """Row from or up to which poses are nearly all rejected, and a finding on it; 0 and none without.
 
     rejected : (V, K) views of poses that mostly are; names : of the views.
     """
-    views = [
-        ("", rejected.all(axis=0)),
-        *((f" in the {name} view", rejected[v]) for v, name in enumerate(names)),
-    ]
+    views = [((), rejected.all(axis=0)), *(((name,), rejected[v]) for v, name in enumerate(names))]
     for where, gone in views:
         for which, row in (("first", gone), ("last", gone[::-1])):
             count = beginning_in(row)
             if max(_WRONG_RUN, MUCH * len(row)) <= count < len(row):
-                return count if which == "first" else len(row) - count, (
-                    f"the fit rejects nearly all of the {which} {count} poses{where}: the base, a camera, "
-                    "the tool or the readings of joints changed there; record again, or remove these poses"
+                onset = count if which == "first" else len(row) - count
+                return onset, Finding(
+                    "rejected_poses", REFUSES, Subject(views=where, name=which), count, unit="1"
                 )
-    return 0, ""
+    return 0, None
 
 
-def _describe_order(solution: Solution, rejected: BoolArray) -> str | None:
-    """Describe poses of several joints that are rejected where those of one are not, or None.
+def _wrong_order(solution: Solution, rejected: BoolArray) -> Finding | None:
+    """Find poses of several joints that are rejected where those of one are not, or None.
 
     One joint at a time moves alike whichever column its readings are in: only together they show the order.
     rejected : (V, K) views of poses that mostly are.
@@ -288,33 +282,35 @@ def _describe_order(solution: Solution, rejected: BoolArray) -> str | None:
     few = wrong < max(_WRONG_POSES, _WRONG_SHARE * count)
     if few or alone * count > _OTHERS_SHARE * wrong * others:
         return None
-    return (
-        f"the fit rejects {wrong} of the {count} poses in which several joints move, and {alone} of the "
-        f"{others} others; check the order of the joints (q1, q2, ...) and the readings of these poses"
-    )
+    rest = Finding("joint_order", REFUSES, amount=int(alone), limit=int(others), unit="1")
+    return Finding("joint_order", REFUSES, amount=int(wrong), limit=int(count), unit="1", others=(rest,))
 
 
 def contradiction(
     whole: Solution, solution: Solution, found: Outliers, epipolar: ImageGeometry, stated_px: float
-) -> str:
-    """Describe evidence against a fit that rejects much, and a remedy; empty if there is none.
+) -> Finding | None:
+    """Find evidence against a fit that rejects much.
 
     The noise is that of the images, whatever was given. Of a fit that leaves more than the noise of the rig
     the rejected detections must agree on no other motion.
     """
-    if solution.used.sum() < _KEPT * whole.problem.detections.seen.sum():
-        return "that is most of them; remove markers that are not on the robot, and check the joint readings"
+    total = whole.problem.detections.seen.sum()
+    gone = float(1.0 - solution.used.sum() / total)
+    if solution.used.sum() < _KEPT * total:
+        return Finding("rejects_most", REFUSES, amount=gone, limit=1.0 - _KEPT, unit="1")
     ratio = solution.sigma_px / epipolar.noise_px
     if ratio > _CONTRADICTED_RATIO:
-        return (
-            f"the rest errs {ratio:.2g} times as much as noise; check the joint readings and types (R or P)"
-        )
-    if ratio > DOUBTED_RATIO and (other := describe_other_motion(solution, found, epipolar)):
+        rest = Finding("residuals", REFUSES, amount=ratio, limit=_CONTRADICTED_RATIO, unit="1")
+        return Finding("rest_is_off", REFUSES, amount=gone, unit="1", others=(rest,))
+    if ratio > DOUBTED_RATIO and (other := other_motion(solution, found, epipolar)):
         return other
     held_out = cross_validate(solution.kept(), solution.sigma_px, _PARTS, 0, blocks=False)
     rms, predicted = held_out.rms_px, held_out.predicted_rms_px
-    if held_out.failed or rms is None or predicted is None:
-        return "the rest does not predict held-out poses; record more poses and more markers"
-    if rms > _DOUBTED_ERROR * np.hypot(predicted, stated_px):
-        return "the rest does not predict held-out poses; record more poses and more markers"
-    return ""
+    if (
+        held_out.failed
+        or rms is None
+        or predicted is None
+        or rms > _DOUBTED_ERROR * np.hypot(predicted, stated_px)
+    ):
+        return Finding("rest_predicts_nothing", REFUSES, amount=gone, unit="1")
+    return None

@@ -1,11 +1,13 @@
 """Screening of a recording before all geometry: unseen poses, placeholders, and readings that pass a turn."""
 
 import dataclasses
+import math
 from typing import NamedTuple
 
 import numpy as np
 
 from projservo_cli.calibration.detections import require_shapes
+from projservo_cli.findings import LIMITS, Finding, Subject
 from projservo_cli.records import FloatArray, IntArray, Observation
 
 # Maximum distance around the circle between both ends of readings that pass a full turn, rad, and in mean
@@ -19,8 +21,8 @@ _REPEATED, _MARKERS = 3, 4
 _CORNERS, _BELOW, _MORE = (0.0, -1.0), 0.01, 2.0
 # Quartile distances beyond the quartiles above which no detection lies, J. W. Tukey's outer fence.
 _FENCE = 3.0
-# Maximum number of numbers that a message names.
-_EXAMPLES = 3
+# Degree, rad, by which readings stay within the ends of a turn.
+_DEGREE = math.radians(1.0)
 
 
 class _Screening(NamedTuple):
@@ -30,7 +32,7 @@ class _Screening(NamedTuple):
     unseen: IntArray  # numbers of the poses at rest that no camera saw
     placeholders: int  # number of detections that stood for an unseen marker
     circular: IntArray  # numbers of the joints, from 1, whose readings passed a full turn
-    advice: tuple[str, ...]  # a line for each kind that was found
+    findings: tuple[Finding, ...]
 
 
 def screened(observation: Observation, joint_types: str) -> _Screening:
@@ -39,30 +41,28 @@ def screened(observation: Observation, joint_types: str) -> _Screening:
     Raises InputError if the arrays do not fit each other.
     """
     require_shapes(observation)
-    images, advice = without_placeholders(observation.images)
+    images, found = without_placeholders(observation.images, observation.marker)
     count = int(np.isnan(images[..., 0]).sum() - np.isnan(observation.images[..., 0]).sum())
     lost = np.asarray(np.isnan(images)).any(axis=3).reshape(len(images), -1).all(axis=1)
     if observation.moving is not None:
         lost &= observation.moving == 0
     if (unseen := observation.pose[lost]).size:
-        numbers = ", ".join(map(str, unseen[:_EXAMPLES])) + ", …" * (unseen.size > _EXAMPLES)
-        advice += (
-            f"poses that no camera saw: {unseen.size} ({numbers}), dropped; look why they show no marker",
-        )
+        subject = Subject(poses=tuple(unseen.tolist()))
+        found += (Finding("unseen_poses", LIMITS, subject, unseen.size, unit="1"),)
     kept = dataclasses.replace(observation, images=images).rows(np.asarray(~lost))
     q, joints = np.array(kept.q, dtype=np.float64), list[int]()
     for i, letter in enumerate(joint_types.upper()[: q.shape[1]]):
         if letter == "R" and (turns := _turns(q[:, i])).any():
-            low, high = np.degrees([q[:, i].min(), q[:, i].max()])
-            end = 180 * round((low + high) / 360.0 + 1.0) - 1  # of the convention of the readings
+            low, high = float(q[:, i].min()), float(q[:, i].max())
+            end = math.pi * round(0.5 * (low + high) / math.pi + 1.0) - _DEGREE  # of their convention
             q[:, i] += 2.0 * np.pi * turns
-            first, last = np.degrees([q[:, i].min(), q[:, i].max()])
             joints.append(i + 1)
-            advice += (
-                f"readings of joint {i + 1} pass {end}° to {end - 358}°: taken as {first:.4g}° to "
-                f"{last:.4g}° (a range of {last - first:.3g}°, as given {high - low:.3g}°)",
-            )
-    return _Screening(dataclasses.replace(kept, q=q), unseen, count, np.array(joints, dtype=np.int64), advice)
+            other = end - 2.0 * (math.pi - _DEGREE)
+            ends = (Finding("circular_readings", amount=end, limit=other, unit="rad"),)
+            subject, taken, given = Subject(joints=(i + 1,)), float(np.ptp(q[:, i])), high - low
+            one = Finding("circular_readings", LIMITS, subject, taken, limit=given, unit="rad", others=ends)
+            found += (one,)
+    return _Screening(dataclasses.replace(kept, q=q), unseen, count, np.array(joints, dtype=np.int64), found)
 
 
 def _turns(q: FloatArray) -> FloatArray:
@@ -87,8 +87,8 @@ def _turns(q: FloatArray) -> FloatArray:
     return np.asarray(turns - values[np.argmax(count)])
 
 
-def without_placeholders(images: FloatArray) -> tuple[FloatArray, tuple[str, ...]]:
-    """Images (K, V, m, 2) with NaN for numbers that stand for unseen markers, and advice that names them.
+def without_placeholders(images: FloatArray, marker: IntArray) -> tuple[FloatArray, tuple[Finding, ...]]:
+    """Images (K, V, m, 2) with NaN for numbers that stand for unseen markers, and findings that name them.
 
     Such a number, as 9999, -1 or 0, repeats exactly over markers and poses: far outside the others or at the
     corner of the image in one coordinate, as one pixel of two markers in an image, or as a subpixel of many.
@@ -124,13 +124,15 @@ def without_placeholders(images: FloatArray) -> tuple[FloatArray, tuple[str, ...
     for label, k, j in zip(found[wrong], at[0][wrong].tolist(), at[2][wrong].tolist(), strict=True):
         name = ", ".join(f"{axis} = {x:.6g}" for axis, x in zip("uv", label, strict=True) if np.isfinite(x))
         named.setdefault(name, set()).add((k, j))
-    each = [
-        f"{name} stands in {len(rows)} rows of "
-        + ("several markers and poses" if len({j for _, j in rows}) > 1 else "several poses of one marker")
-        for name, rows in sorted(named.items(), key=lambda item: -len(item[1]))
-    ]
-    more = f"; {len(each) - _EXAMPLES} further numbers" if len(each) > _EXAMPLES else ""
     images = images.copy()
     images[tuple(part[wrong] for part in at)] = np.nan
-    why = "no camera saw that, so it was taken as unseen; empty these cells"
-    return images, (f"{'; '.join(each[:_EXAMPLES])}{more}: {why}",)
+    return images, tuple(
+        Finding(
+            "placeholders",
+            LIMITS,
+            Subject(markers=tuple(int(marker[j]) for j in sorted({j for _, j in rows})), name=name),
+            len(rows),
+            unit="1",
+        )
+        for name, rows in sorted(named.items(), key=lambda item: -len(item[1]))
+    )

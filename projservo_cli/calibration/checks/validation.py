@@ -28,6 +28,7 @@ from projservo_cli.records import (
     Observation,
     WorkFailed,
 )
+from projservo_cli.words import lines, setup_of
 
 # Minimum number of parts in a cross-validation.
 _MIN_FOLDS = 2
@@ -298,11 +299,11 @@ def residual_statistics(calibration: Calibration, observation: Observation) -> d
     Raises InputError if the readings have another number of joints or are not finite.
     """
     observation = of_views(observation.at_rest, calibration.view)
-    images, advice = without_placeholders(observation.images)
+    images, told = without_placeholders(observation.images, observation.marker)
     observation = replace(observation, images=images)
     board = BoardNumbering.of(observation)
     board.turn_by(calibration)
-    observation, advice = board.observation, (*advice, *board.advice)
+    observation, told = board.observation, (*told, *board.findings)
     known = np.isin(observation.marker, calibration.marker)
     numbers = calibration.marker.tolist()
     order = [numbers.index(number) for number in observation.marker[known].tolist()]
@@ -343,7 +344,7 @@ def residual_statistics(calibration: Calibration, observation: Observation) -> d
             "behind_camera": int((seen[:, :, known] & ~ahead).sum()),
             "missing": int((~seen).sum()),
         },
-        "advice": list(advice),
+        "advice": list(lines(told, setup_of(calibration))),
     }
 
 

@@ -1,0 +1,117 @@
+"""Findings: what a judgement says of a calibration, a robot, a plan or a run, as data.
+
+``projservo_cli.words`` has the sentences.
+"""
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+
+_M_PER_RAD = 0.3  # a motion of a prismatic joint that counts as much as one of a revolute joint, m/rad
+# Severities: a note changes nothing, a finding that limits makes the result less exact, and one that refuses
+# makes it useless.
+NOTE, LIMITS, REFUSES = "note", "limits", "refuses"
+# Codes of deviations of an arm or a rig from the model.
+DEVIATIONS = (
+    *("scale", "quadratic", "cubic", "harmonic", "coupling", "sag", "joint_drift", "joint_step"),
+    *("camera_drift", "camera_step", "base", "tool", "lens", "lens_center", "focus"),
+)
+
+
+@dataclass(frozen=True)
+class Subject:
+    """The thing that a finding is about; what does not apply is empty."""
+
+    joints: tuple[int, ...] = ()  # numbers along the arm, from 1; of a coupling the moved one last
+    views: tuple[str, ...] = ()
+    markers: tuple[int, ...] = ()
+    tag: int | None = None
+    poses: tuple[int, ...] = ()  # numbers of the poses; of a step the one at which it begins
+    name: str = ""  # of an object, a feature, a law, a column, a file or an origin
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that is off, or limits, or refuses."""
+
+    code: str  # a key of ``words.ROWS``
+    severity: str = NOTE
+    subject: Subject = Subject()
+    amount: float = math.nan  # in ``unit``; NaN where there is none, as of the next
+    deviation: float = math.nan  # standard deviation of the amount
+    limit: float = math.nan  # that the amount is held against
+    unit: str = ""  # px, rad, m, s, or 1 for a share or a count
+    effect_px: float = math.nan  # rms error of predicted images by it, per marker and view
+    others: tuple["Finding", ...] = ()  # that the data do not tell from it, or that it consists of
+
+    def plain(self) -> dict[str, Any]:
+        """Return its fields for JSON: NaN is null, and of the subject there is what applies."""
+        values = asdict(self)
+        del values["others"]
+        subject = {name: value for name, value in values["subject"].items() if value not in ((), "", None)}
+        known = {name: value for name, value in values.items() if value == value}  # but NaN
+        return dict.fromkeys(values) | known | {"subject": subject}
+
+
+def sparse(record: Any) -> dict[str, Any]:
+    """Return the fields of a finding or a subject for a file, those that are not NaN or as by default."""
+    own = {one.name: (getattr(record, one.name), one.default) for one in fields(record)}
+    return {name: value for name, (value, default) in own.items() if value == value and value != default}
+
+
+def first(findings: Iterable[Finding], *severities: str) -> Finding | None:
+    """Return the first finding of some severities, or None."""
+    return next((one for one in findings if one.severity in severities), None)
+
+
+def usable(findings: Iterable[Finding]) -> bool:
+    """Whether no finding refuses."""
+    return first(findings, REFUSES) is None
+
+
+def named(one: Finding) -> str:
+    """Return code, joints and view of a finding in one word."""
+    return f"{one.code}|{','.join(map(str, one.subject.joints))}|{''.join(one.subject.views)}"
+
+
+def of_readings(one: Finding) -> tuple[float, float]:
+    """Return amount and deviation, of a prismatic joint in rad × 0.3 m."""
+    per = _M_PER_RAD if one.unit == "m" else 1.0
+    return one.amount / per, one.deviation / per
+
+
+def columns(findings: Iterable[Finding]) -> dict[str, Any]:
+    """Return the deviations from the model as the columns of a run file, and the one that is not shown."""
+    shown = [one for one in findings if one.code in DEVIATIONS]
+    hidden = [other for one in findings if one.code == "unshown" for other in one.others]
+    found: dict[str, Any] = {}
+    for name, rows in (("model_error", shown), ("unshown", hidden)):
+        numbers = [(*of_readings(one), one.effect_px, *(one.subject.poses or (math.nan,))) for one in rows]
+        words = tuple("/".join(map(named, (one, *one.others))) for one in rows)
+        found[f"{name}_numbers"] = np.array(numbers) if rows else None
+        found[name if name == "model_error" else "unshown_error"] = words
+    if hidden:
+        found["unshown_numbers"] = found["unshown_numbers"][0]
+    return found
+
+
+def of_columns(name: str, numbers: Iterable[float], units: Sequence[str]) -> Finding:
+    """Return a deviation from its columns in a run file; units : of the joints, rad or m."""
+    one, *others = (_parsed(word, units) for word in name.split("/"))
+    estimate, deviation, effect, pose = map(float, numbers)
+    per = _M_PER_RAD if one.unit == "m" else 1.0
+    subject = replace(one.subject, poses=() if math.isnan(pose) else (int(pose),))
+    sizes = per * estimate, per * deviation
+    return Finding(one.code, LIMITS, subject, *sizes, unit=one.unit, effect_px=effect, others=tuple(others))
+
+
+def _parsed(word: str, units: Sequence[str]) -> Finding:
+    """Return a finding on what ``named`` wrote."""
+    code, joints, view = word.split("|")
+    which = tuple(int(joint) for joint in joints.split(",") if joint)
+    of_joint = units[which[-1] - 1] if which else "px"
+    subject = Subject(joints=which, views=(view,) if view else ())
+    return Finding(code, LIMITS, subject, unit="1" if code in ("scale", "coupling") else of_joint)

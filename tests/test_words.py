@@ -1,0 +1,76 @@
+"""Words for findings: each code, before any cameras, for joints that turn and that slide."""
+
+import itertools
+import re
+
+import pytest
+
+from projservo_cli import words
+from projservo_cli.findings import DEVIATIONS, LIMITS, REFUSES, Finding, Subject
+from projservo_cli.records import TOOL, WORLD
+
+VIEWS = ("left", "right", "top", "far side")
+COUNTED = Finding(
+    "id_switches", subject=Subject(views=("left",), markers=(5,)), amount=3.0, limit=9.0, unit="1"
+)
+
+
+def finding(code, joint_unit):
+    """A finding with all that its words may name."""
+    unit = {"scale": "1", "coupling": "1"}.get(code, joint_unit if "joint" in code else "px")
+    joints = (3, 2) if code == "coupling" else (2,)
+    subject = Subject(joints, ("left", "right"), (5, 6), None, (7, 9), "arm.json")
+    return Finding(code, LIMITS, subject, 0.02, 0.001, 0.5, unit, 1.5, (COUNTED, COUNTED, COUNTED))
+
+
+@pytest.mark.parametrize("code", words.ROWS)
+def test_each_finding_has_words_whatever_the_arm_and_the_cameras(code):
+    for mount, count, unit in itertools.product((WORLD, TOOL), (1, 2, 3, 4), ("rad", "m")):
+        one = finding(code, unit)
+        setup = words.Setup(mount, VIEWS[:count], 1 if count == 1 else 6)
+        if code in DEVIATIONS:
+            one = Finding(**vars(one) | {"others": (finding("joint_step", unit), finding("base", unit))})
+        for text in (words.line(one, setup), words.limit(one, setup)):
+            assert not re.search(r"[{}]|\bnan\b|  |None", text), text
+        line = words.line(one, setup)
+        told = line.split(" (or ")[0]
+        if "joint" in code and "{size}" in words.ROWS[code].sentence:
+            assert {"rad": "1.1°", "m": "20 mm"}[unit] in told
+        if code == "tool":
+            assert ("on the tool" if mount == WORLD else "in the scene") in told
+        if "{joints}" in words.ROWS[code].sentence:
+            assert "joint" in line
+
+
+def test_deviations_name_what_else_explains_the_images():
+    one = finding("scale", "rad")
+    one = Finding(**vars(one) | {"others": (finding("joint_step", "rad"), finding("base", "rad"))})
+    line = words.line(one, words.Setup())
+    assert "(or step of joint 2, or motion of the base or the cameras: the images do not tell); fit" in line
+    assert line.startswith("joint 2 moves 2 % ± 0.1 % more than it reads")
+
+
+def test_joints_that_are_alike_share_a_line():
+    few = [
+        Finding("little_motion", LIMITS, Subject(joints=(i,)), 0.05, limit=0.2 * i, unit="rad")
+        for i in (1, 2)
+    ]
+    one = Finding("little_motion", LIMITS, Subject(joints=(4,)), 0.01, limit=0.05, unit="m")
+    together = words.lines([*few, one], words.Setup())
+    assert together == (
+        "joints 1, 2 and 4 moved only 2.86°, 2.86° and 10 mm: move each at least 11.5°, 22.9° and 50 mm",
+    )
+
+
+def test_a_refusal_names_its_cause_first_and_a_hint_last():
+    cause = Finding("joint_type", REFUSES, Subject(joints=(2,), name="RPR"), unit="m")
+    misfit = Finding("misfit", REFUSES, Subject(name="views"), 3.0, limit=0.5, unit="px")
+    hint = finding("sag", "rad")
+    text = words.refused([cause, misfit], words.Setup())
+    assert text.startswith("by the images joint 2 is prismatic, not revolute: check the types of joints, ")
+    assert "(RPR would fit); as given, the fit does not describe the data: residuals of 3 px a" in text
+    assert text.endswith(
+        "are 6 times the 0.5 px that the epipolar geometry shows; check the joint readings, "
+        "their units and types, and the marker numbers"
+    )
+    assert "; the residuals look as if joint 2 sags" in words.refused([misfit, hint], words.Setup())
