@@ -443,8 +443,9 @@ def setup_of(calibration: Calibration) -> Setup:
 
 def _cause(findings: Sequence[Finding]) -> Finding:
     """Return the finding that limits predictions most: one that refuses, else the first that limits."""
-    about, *rest = (one for one in findings if ROWS[one.code].limit)
-    return first(rest, REFUSES) or first(rest, LIMITS) or about
+    about, *rest = findings
+    limiting = [one for one in rest if ROWS[one.code].limit]
+    return first(limiting, REFUSES) or first(limiting, LIMITS) or about
 
 
 def _row(one: Finding, setup: Setup) -> Row:

@@ -13,6 +13,7 @@ from projservo_cli.records import InputError, Plan, Trace
 from projservo_cli.results import RunTrace
 from projservo_cli.store import run_file
 from projservo_cli.store.run_file import save_record
+from projservo_cli.words import with_findings
 from tests.fake_records import fake
 from tests.store.deceit import EDITS, HEADS, edited, head, resealed
 from tests.store.sound import result, sound_file, sound_run
@@ -58,6 +59,7 @@ def test_a_calibration_of_an_earlier_version_has_its_sentences_as_findings(path)
     told = [one.subject.name for one in calibration.findings if one.code == "told"]
     assert told == [before.reason, *before.advice]
     assert usable(calibration.findings) == before.usable
+    assert with_findings(calibration, ()).reason == before.reason  # as a refit judges it once more
 
 
 def test_everything_comes_back(tmp_path):
