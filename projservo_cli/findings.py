@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-_M_PER_RAD = 0.3  # a motion of a prismatic joint that counts as much as one of a revolute joint, m/rad
+# Distance and angle by which a joint moves as far as another, m and rad: predictions are assessed there.
+REACH_M, REACH_RAD = 0.15, 0.5
 # Severities: a note changes nothing, a finding that limits makes the result less exact, and one that refuses
 # makes it useless.
 NOTE, LIMITS, REFUSES = "note", "limits", "refuses"
@@ -79,7 +80,7 @@ def named(one: Finding) -> str:
 
 def of_readings(one: Finding) -> tuple[float, float]:
     """Return amount and deviation, of a prismatic joint in rad × 0.3 m."""
-    per = _M_PER_RAD if one.unit == "m" else 1.0
+    per = REACH_M / REACH_RAD if one.unit == "m" else 1.0
     return one.amount / per, one.deviation / per
 
 
@@ -87,22 +88,29 @@ def columns(findings: Iterable[Finding]) -> dict[str, Any]:
     """Return the deviations from the model as the columns of a run file, and the one that is not shown."""
     shown = [one for one in findings if one.code in DEVIATIONS]
     hidden = [other for one in findings if one.code == "unshown" for other in one.others]
-    found: dict[str, Any] = {}
-    for name, rows in (("model_error", shown), ("unshown", hidden)):
-        numbers = [(*of_readings(one), one.effect_px, *(one.subject.poses or (math.nan,))) for one in rows]
-        words = tuple("/".join(map(named, (one, *one.others))) for one in rows)
-        found[f"{name}_numbers"] = np.array(numbers) if rows else None
-        found[name if name == "model_error" else "unshown_error"] = words
-    if hidden:
-        found["unshown_numbers"] = found["unshown_numbers"][0]
-    return found
+    return {
+        "model_error": tuple(_word(one) for one in shown),
+        "model_error_numbers": np.array([_numbers(one) for one in shown]) if shown else None,
+        "unshown_error": tuple(_word(one) for one in hidden),
+        "unshown_numbers": np.array(_numbers(hidden[0])) if hidden else None,
+    }
+
+
+def _word(one: Finding) -> str:
+    """Return a deviation and the others that explain the images as well in one word."""
+    return "/".join(map(named, (one, *one.others)))
+
+
+def _numbers(one: Finding) -> tuple[float, ...]:
+    """Return amount, deviation, effect and first pose of a deviation, NaN if it holds in all."""
+    return (*of_readings(one), one.effect_px, *(one.subject.poses or (math.nan,)))
 
 
 def of_columns(name: str, numbers: Iterable[float], units: Sequence[str]) -> Finding:
     """Return a deviation from its columns in a run file; units : of the joints, rad or m."""
     one, *others = (_parsed(word, units) for word in name.split("/"))
     estimate, deviation, effect, pose = map(float, numbers)
-    per = _M_PER_RAD if one.unit == "m" else 1.0
+    per = REACH_M / REACH_RAD if one.unit == "m" else 1.0
     subject = replace(one.subject, poses=() if math.isnan(pose) else (int(pose),))
     sizes = per * estimate, per * deviation
     return Finding(one.code, LIMITS, subject, *sizes, unit=one.unit, effect_px=effect, others=tuple(others))

@@ -70,7 +70,7 @@ _OF_MODEL = {
     "camera_step": Row("motion of the {view} camera", "the {view} camera moved{begin}, by {size}", _AGAIN),
     "base": Row(
         "motion of the base or the cameras",
-        "the base of the arm or all cameras moved{begin}, by {size}",
+        "the base of the arm or {all_cameras} moved{begin}, by {size}",
         _AGAIN,
     ),
     "tool": Row("markers that moved on the tool", "{markers} moved on the tool{begin}, by {size}", _AGAIN),
@@ -153,15 +153,14 @@ _CALIBRATION = {
     "little_motion": Row("{name}", "{joints} moved only {amount}", "move {it} at least {limit}"),
     "noisy_view": Row(
         "",
-        "the {view} camera is {ratio} times as noisy as the {other_view} one ({amount} and {limit}), and "
-        "counts "
-        "less",
+        "the {view} camera is {ratio} times as noisy as the {other_view} one ({amount} and {limit}), "
+        "and counts less",
         "check its focus, light and mount",
     ),
     "exact_images": Row(
         "exact images",
-        "the images have no noise ({amount}): they were made from poses, whose errors no two markers show "
-        "apart",
+        "the images have no noise ({amount}): they were made from poses, whose errors no two markers "
+        "show apart",
         "give the noise of these (--noise-px)",
     ),
     "unsettled_camera": Row(
@@ -209,8 +208,7 @@ _CALIBRATION = {
     "refitted_camera": Row(
         "the {view} camera",
         "the {view} camera, fitted again from {rest} poses, errs by {amount} within the joint ranges, "
-        "{limit} "
-        "before it moved",
+        "{limit} before it moved",
         "add poses that spread farther",
     ),
     "refit_too_coarse": Row(
@@ -258,8 +256,7 @@ _REFUSALS = {
         "the joint readings",
         "the data contradict the joint readings from the start",
         "check that they belong to their poses, their units (rad, m) and types (R or P), and that rows of "
-        "one "
-        "pose belong together",
+        "one pose belong together",
     ),
     "no_turn": Row("joint types", "residuals of {amount} show no turn of it"),
     "rejects_most": Row(
@@ -281,9 +278,8 @@ _REFUSALS = {
     ),
     "other_joints": Row(
         "joint readings",
-        _MISFIT
-        + "{count} of {total} observations, at {rest} of {of_rest} poses, show other joints than those "
-        "read",
+        _MISFIT + "{count} of {total} observations, at {rest} of {of_rest} poses, show other joints than "
+        "those read",
         "check how poses and images are paired, and the joint readings and types (R or P)",
     ),
     "rejected_motion": Row(
@@ -293,16 +289,14 @@ _REFUSALS = {
     ),
     "rejected_poses": Row(
         "poses",
-        "the fit rejects nearly all of the {name} {count} poses{in_view}: the base, a camera, the tool or "
-        "the "
-        "readings of joints changed there",
+        "the fit rejects nearly all of the {name} {count} poses{in_view}: the base, a camera, the tool "
+        "or the readings of joints changed there",
         "record again, or remove these poses",
     ),
     "joint_order": Row(
         "the order of joints",
         "the fit rejects {count} of the {total} poses in which several joints move, and {rest} of the "
-        "{of_rest} "
-        "others",
+        "{of_rest} others",
         "check the order of the joints (q1, q2, ...) and the readings of these poses",
     ),
 }
@@ -343,9 +337,10 @@ def quantity(value: float, unit: str, digits: int = 3) -> str:
     return f"{factor * value:.{digits}g}{name}"
 
 
-def joined(words: Sequence[str]) -> str:
+def joined(words: Iterable[object]) -> str:
     """Join words by commas, the last by "and"."""
-    return " and ".join(filter(None, (", ".join(words[:-1]), words[-1] if words else "")))
+    told = [*map(str, words)]
+    return " and ".join(filter(None, (", ".join(told[:-1]), *told[-1:])))
 
 
 def limit(one: Finding, setup: Setup) -> str:
@@ -473,7 +468,10 @@ def _values(alike: Sequence[Finding], setup: Setup) -> dict[str, Any]:
     joints = [joint for each in alike for joint in each.subject.joints]
     amount, limit = one.amount, one.limit
     single, alone, many = len(joints) == 1, setup.joints == 1, amount != 1.0
+    all_cameras = "the camera" if len(setup.view) == 1 else "all cameras"
+    cameras = "both cameras" if len(setup.view) == 2 else all_cameras
     values: dict[str, Any] = {
+        "all_cameras": all_cameras,
         "of": subject.joints,
         "name": subject.name,
         "joints": "all joints" if one.code == "scale" and not single else _named("joint", joints),
@@ -521,7 +519,7 @@ def _values(alike: Sequence[Finding], setup: Setup) -> dict[str, Any]:
         "mount": subject.name,
         "fits": "prismatic" if one.unit == "m" else "revolute",
         "given": "revolute" if one.unit == "m" else "prismatic",
-        "leads": "does not put the markers in front of both cameras"
+        "leads": f"does not put the markers in front of {cameras}"
         if math.isnan(one.amount)
         else f"leads to residuals of {quantity(amount, 'px')} instead of {quantity(limit, 'px')}",
         "stands": _stands(alike),
@@ -577,7 +575,7 @@ def _size(one: Finding) -> str:
 
 def _named(kind: str, numbers: Sequence[int]) -> str:
     """Name things of a kind by their numbers."""
-    return f"{kind}{'s' * (len(numbers) > 1)} {joined([str(number) for number in numbers])}"
+    return f"{kind}{'s' * (len(numbers) > 1)} {joined(numbers)}"
 
 
 def _examples(numbers: Sequence[int]) -> str:

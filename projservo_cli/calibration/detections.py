@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from scipy.special import chdtri
 
-from projservo_cli.findings import LIMITS, Finding, Subject
+from projservo_cli.findings import LIMITS, REACH_M, REACH_RAD, Finding, Subject
 from projservo_cli.records import (
     TOOL,
     VIEWS,
@@ -39,10 +39,6 @@ MIN_SIGMA = 1e-4
 MAD = 0.6744897501960817
 # Median of the length of a two-dimensional normal vector of unit deviation.
 RAYLEIGH = 1.1774100225154747
-# Distance from the reference at which predictions are assessed, revolute joints, rad.
-REACH_RAD = 0.5
-# Distance from the reference at which predictions are assessed, prismatic joints, m.
-REACH_M = 0.15
 # Maximum trial motion to advise, in reaches.
 MAX_REACHES = 4.0
 # Codes of joints that no motion determines, that moved with others alone, seldom, or too little.

@@ -1,7 +1,7 @@
 """Claims of the paper about its method against the runs; no verdict is fixed beforehand."""
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -21,6 +21,7 @@ from projservo_cli.report.report_data import (
     curve_difference,
     percent,
 )
+from projservo_cli.words import joined
 
 
 class _Claim(NamedTuple):
@@ -39,12 +40,6 @@ class _Claim(NamedTuple):
 def _listed(values: FloatArray) -> str:
     """Numbers as a list in words, three digits each, large ones whole."""
     return ", ".join(f"{value:.0f}" if value >= 100 else f"{value:.3g}" for value in np.atleast_1d(values))
-
-
-def _joined(words: Iterable[object]) -> str:
-    """Words in a list with an "and" before the last."""
-    *first, last = map(str, words)
-    return f"{', '.join(first)} and {last}" if first else last
 
 
 def _cameras(views: int, two: str, more: str) -> str:
@@ -226,7 +221,7 @@ def _cures(studies: Studies, composition: Composition | None, still: bool) -> It
     yield _Claim(
         "λ_t can be set as high as visibility permits",
         "section 5.2",
-        f"{trace.verdict}, {_joined(trace.self_occluded_steps)} self-occluded steps; drift {fast:.3g} mm "
+        f"{trace.verdict}, {joined(trace.self_occluded_steps)} self-occluded steps; drift {fast:.3g} mm "
         f"where a step takes 0.9 of the translation, {three:.3g} mm where it takes {share:g}",
         "converges, no self-occlusion, and the drift is no larger (directTHREE, true operators, no limit)",
         trace.verdict == "converged"
@@ -392,11 +387,11 @@ def _classical(report_data: ReportData) -> Iterator[_Claim]:
 
 
 def _escape(law: str, trace: Trace, window: int) -> Iterator[_Claim]:
-    hidden, cameras = trace.self_occluded_steps, _joined(trace.view)
+    hidden, cameras = trace.self_occluded_steps, joined(trace.view)
     yield _Claim(
         f"{title_of(law)}: runs through self-occlusion, then converges",
         "section 6, Fig. 4",
-        f"{_joined(hidden)} self-occluded steps in the {cameras} camera; {trace.verdict}",
+        f"{joined(hidden)} self-occluded steps in the {cameras} camera; {trace.verdict}",
         f"steps in {_cameras(len(hidden), 'both', 'all')}, verdict converged",
         min(hidden) > 0 and trace.verdict == "converged",
     )
@@ -460,8 +455,8 @@ def _direct(report_data: ReportData) -> Iterator[_Claim]:
         yield _Claim(
             "The centre moves horizontally in the images: its ordinate stays constant",
             "section 6, Fig. 11",
-            f"ordinate varies by {_joined(f'{v:.1f}' for v in variation)} px while the abscissa travels "
-            f"{_joined(f'{u:.0f}' for u in travel)} px ({', '.join(report_data.view)})",
+            f"ordinate varies by {joined([f'{v:.1f}' for v in variation])} px while the abscissa travels "
+            f"{joined([f'{u:.0f}' for u in travel])} px ({', '.join(report_data.view)})",
             f"variation at most {_LEVEL_SHARE:.0%} of the travel",
             bool((variation <= _LEVEL_SHARE * travel).all()),
         )

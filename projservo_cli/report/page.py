@@ -13,10 +13,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from projservo_cli.calibration.checks.quality import WEAK_NOISE
-from projservo_cli.calibration.detections import REACH_M, REACH_RAD
 from projservo_cli.calibration.robust_fit import chi2_band
 from projservo_cli.display import About
 from projservo_cli.files import lies_inside, write_whole
+from projservo_cli.findings import REACH_M, REACH_RAD
 from projservo_cli.laws import must_converge, run_name
 from projservo_cli.records import Plan, Report
 from projservo_cli.report.figures import FIGURES

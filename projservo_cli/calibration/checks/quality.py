@@ -12,8 +12,6 @@ from projservo_cli.calibration.checks.model_error import ModelCheck, examine
 from projservo_cli.calibration.detections import (
     MAX_JUDGED,
     MAX_REACHES,
-    REACH_M,
-    REACH_RAD,
     Detections,
     even_choice,
     require_motion,
@@ -23,7 +21,7 @@ from projservo_cli.calibration.detections import (
 from projservo_cli.calibration.joint_noise import quantile
 from projservo_cli.calibration.prediction import Parameters
 from projservo_cli.calibration.robust_fit import Expected, Solution
-from projservo_cli.findings import LIMITS, NOTE, REFUSES, Finding, Subject
+from projservo_cli.findings import LIMITS, NOTE, REACH_M, REACH_RAD, REFUSES, Finding, Subject
 from projservo_cli.records import BoolArray, Errors, FloatArray, IntArray, WorkFailed, apart
 from projservo_cli.words import line
 
