@@ -31,7 +31,7 @@ class Subject:
     markers: tuple[int, ...] = ()
     tag: int | None = None
     poses: tuple[int, ...] = ()  # numbers of the poses; of a step the one at which it begins
-    name: str = ""  # of an object, a feature, a law, a column, a file or an origin
+    name: str = ""  # of an object, a feature, a law, a column, a file, an origin or a limit
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from projservo_cli.findings import DEVIATIONS, Finding
+from projservo_cli.findings import DEVIATIONS, LIMITS, Finding, Subject
 from projservo_cli.passwords import masked
 
 FloatArray = npt.NDArray[np.float64]
@@ -474,6 +474,14 @@ class Rejections:
     undecided_order: IntArray | None = _optional_array(
         "undecided_pair pair_end", about="pairs of joints, from 1, whose order no pose shows"
     )
+
+    @property
+    def open_order(self) -> tuple[Finding, ...]:
+        """A finding on the joints whose order no pose shows, if there are any."""
+        if self.undecided_order is None or not self.undecided_order.size:
+            return ()
+        joints = tuple(np.unique(self.undecided_order).tolist())
+        return (Finding("undecided_order", LIMITS, Subject(joints=joints)),)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -427,8 +427,7 @@ def with_findings(
 
 def order_advice(calibration: Calibration) -> str:
     """Return the line on joints whose order nothing shows; empty if there are none, or it was not tested."""
-    open_ones = (one for one in calibration.findings if one.code == "undecided_order")
-    return "".join(line(one, setup_of(calibration)) for one in open_ones)
+    return "".join(line(one, setup_of(calibration)) for one in calibration.open_order)
 
 
 def setup_of(calibration: Calibration) -> Setup:

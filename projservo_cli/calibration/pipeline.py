@@ -309,15 +309,15 @@ def _refined(
     """Record of the maximum-likelihood solution in its projective frame, with its covariance."""
     share = share_explained(whole, frame)
     solution, kept = whole.determined()
-    whole_seen = whole.problem.detections
+    detections = whole.problem.detections
     of_lens = Finding("unmodelled_lens", LIMITS, amount=share, unit="1")
     try:
         if (why := refusal(solution, expected)) is not None:
-            raise Misfit.by([why], whole_seen)
+            raise Misfit.by([why], detections)
         found = Outliers.of(solution)
         doubt = unexplained(solution, found, epipolar)
         kept_by = np.sum([solution.used | found.explained, solution.used], axis=(1, 2))
-        out, gone = 1.0 - kept_by / whole.problem.detections.seen.sum()
+        out, gone = 1.0 - kept_by / detections.seen.sum()
         much = doubt is not None or out > MUCH or gone > _MAX_REJECTED
         suspicion = Finding("lagging_joints", LIMITS)
         if share:
@@ -333,17 +333,16 @@ def _refined(
             why = contradiction(whole, solution, found, epipolar, record.predicted_rms_px or 0.0)
             if why or (doubt and share >= _DECISIVE_SHARE):
                 raise Misfit.by(
-                    filter(None, [other_motion(solution, found, epipolar) or doubt or why]), whole_seen
+                    filter(None, [other_motion(solution, found, epipolar) or doubt or why]), detections
                 )
     except Misfit as refused:
         hint = deviation(solution, expected) if share < _DECISIVE_SHARE else of_lens
         if hint is None:
             raise
-        raise Misfit.by([*refused.findings, hint], whole_seen) from None
+        raise Misfit.by([*refused.findings, hint], detections) from None
     more = [*_of_lens(record, frame.known)]
     if kept.all():
         return with_findings(record, more)
-    detections = whole.problem.detections
     more.append(Finding("seldom_fitting", LIMITS, Subject(markers=tuple(detections.marker[~kept].tolist()))))
     outlier = np.concatenate(
         [record.outlier, outlier_rows(detections, detections.seen & ~kept[detections.marker_of])]

@@ -15,7 +15,6 @@ from projservo_cli.calibration.pipeline import calibrate
 from projservo_cli.calibration.refit import refit, since_moved
 from projservo_cli.calibration.robust_fit import Solution
 from projservo_cli.files import write_whole
-from projservo_cli.findings import LIMITS, Finding, Subject
 from projservo_cli.geometry.lens import K1
 from projservo_cli.nominal import read_nominal
 from projservo_cli.observations import Observations
@@ -176,11 +175,7 @@ def estimate(
         undecided_order=order[0] if order else None,
         turned_images=board.images,
     )
-    of_order = list[Finding]()
-    if order and order[0].size:
-        pairs = Subject(joints=tuple(np.unique(order[0]).tolist()))
-        of_order.append(Finding("undecided_order", LIMITS, pairs))
-    found = [*of_order, *screening.findings, *board.findings]
+    found = [*calibration.open_order, *screening.findings, *board.findings]
     return board.observation, with_findings(calibration, found), next(iter(held_out), None)
 
 

@@ -44,7 +44,7 @@ from projservo_cli.records import (
     Trace,
     scalars_of,
 )
-from projservo_cli.words import Setup, line, sentence
+from projservo_cli.words import line, sentence, setup_of
 
 if typing.TYPE_CHECKING:
     import h5netcdf
@@ -432,33 +432,32 @@ def load_record(group: h5py.Group, kind: Any, sizes: dict[str, int]) -> Any:
         else:
             values[name] = _array(_member(group, name), dims, inner, own)
     _require_names(group, {*values, *own})
-    if kind is Calibration and "findings" not in group.attrs:
-        values["findings"] = _told(values)
     if "view" in values and len(values["view"]) != own.get("view", len(values["view"])):
         raise ValueError(f"{group.name} has arrays of {own['view']} views, named {', '.join(views)}")
     if "joint" in own:
         sizes["joint"] = own["joint"]
     if "joint_types" in values and not re.fullmatch(f"[RP]{{{own['joint']}}}", values["joint_types"]):
         raise ValueError(f"joint_types are not {own['joint']} letters R and P")
-    return kind(**values)
+    record = kind(**values)
+    if kind is Calibration and "findings" not in group.attrs:
+        return dataclasses.replace(record, findings=_told(record))
+    return record
 
 
-def _told(values: Mapping[str, Any]) -> tuple[Finding, ...]:
+def _told(c: Calibration) -> tuple[Finding, ...]:
     """Findings of a calibration of an earlier version, which stored sentences and columns alone."""
-    units = ["m" if letter == "P" else "rad" for letter in values["joint_types"]]
-    found = [Finding("told", NOTE if values["usable"] else REFUSES, Subject(name=values["reason"]))]
-    rows = () if values["model_error_numbers"] is None else values["model_error_numbers"].tolist()
-    found += [of_columns(*one, units) for one in zip(values["model_error"], rows, strict=True)]
-    order = values["undecided_order"]
-    if order is not None and order.size:
-        found.append(Finding("undecided_order", LIMITS, Subject(joints=tuple(np.unique(order).tolist()))))
-    for one in values["unshown_error"]:
-        hidden = of_columns(one, values["unshown_numbers"].tolist(), units)
+    units, setup = ["m" if letter == "P" else "rad" for letter in c.joint_types], setup_of(c)
+    found = [Finding("told", NOTE if c.usable else REFUSES, Subject(name=c.reason))]
+    rows = () if c.model_error_numbers is None else c.model_error_numbers.tolist()
+    found += [of_columns(*one, units) for one in zip(c.model_error, rows, strict=True)]
+    found += c.open_order
+    if c.unshown_numbers is not None:
+        hidden = of_columns(c.unshown_error[0], c.unshown_numbers.tolist(), units)
         found.append(Finding("unshown", effect_px=hidden.effect_px, others=(hidden,)))
-    known = {text for one in found for text in (line(one, Setup()), sentence(one, Setup()))}
-    for text in values["advice"]:
+    known = {text for one in found for text in (line(one, setup), sentence(one, setup))}
+    for text in c.advice:
         if text not in known:
-            found.append(Finding("told", NOTE if text in values["notes"] else LIMITS, Subject(name=text)))
+            found.append(Finding("told", NOTE if text in c.notes else LIMITS, Subject(name=text)))
     return tuple(found)
 
 

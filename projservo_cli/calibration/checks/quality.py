@@ -227,29 +227,26 @@ def assess(
     # Residuals of a method without covariance are its own errors, not noise of the images.
     sigma = expected.sigma_px if errors is None else expected.noise_px(solution)
     span = _require_joints_seen(solution, sigma)
-    noise, warned = np.full(len(span), np.nan), expected.warns(solution)
+    warned = expected.warns(solution)
+    code, severity = ("residuals", LIMITS) if warned else ("noise", NOTE)
     if errors is None:
-        code, severity = ("closed_form", REFUSES) if warned else ("noise", NOTE)
-        return _Assessment(span, noise, None, None, (expected.finding(code, severity, solution),))
+        code, severity = ("closed_form", REFUSES) if warned else (code, severity)
+        unknown = np.full(len(span), np.nan)
+        return _Assessment(span, unknown, None, None, (expected.finding(code, severity, solution),))
     noise, error, weak = _noise_of_joints(solution, errors, sigma)
     check = None
     if not expected.known:
         check = check_model(solution, errors, sigma)
         factor, effect = check.noise_factor, check.effect_px
         error = (float(np.hypot(factor * error[0], effect)), float(np.hypot(factor * error[1], effect)))
-    found = [
-        expected.finding("residuals", LIMITS, solution)
-        if warned
-        else expected.finding("noise", NOTE, solution)
-    ]
+    found = [expected.finding(code, severity, solution)]
     if check is not None:
         found += _deviations(check, max_predicted_px)
     lags = suspicion.code == "lagging_joints" and warned and not (check and check.errors)
     found += [suspicion] if lags or suspicion.code == "unmodelled_lens" else []
     found += [*weak, *_left_out(solution, outlier, rejected, warned and suspicion.code == "outliers")]
     found += _joint_noise(solution)
-    notes_last = sorted(found[1:], key=lambda one: one.severity == NOTE)
-    return _Assessment(span, noise, error, check, (found[0], *notes_last))
+    return _Assessment(span, noise, error, check, tuple(found))
 
 
 def _noise_of_joints(

@@ -209,10 +209,8 @@ def deviation(solution: Solution, expected: Expected) -> Finding | None:
     """Find the deviation from the model that explains most of a fit that is refused."""
     if expected.known or solution.dof <= 0:
         return None
-    errors, detections = (
-        check_model(solution, solution.errors(), expected.noise_px(solution)).errors,
-        solution.problem.detections,
-    )
+    errors = check_model(solution, solution.errors(), expected.noise_px(solution)).errors
+    detections = solution.problem.detections
     onset = _change(_rejected_views(solution), detections.view)[0]
     if not onset and errors and errors[0].subject.poses:
         onset = int(np.argmax(detections.pose == errors[0].subject.poses[0]))
