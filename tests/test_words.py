@@ -8,6 +8,7 @@ import pytest
 from projservo_cli import words
 from projservo_cli.findings import DEVIATIONS, LIMITS, REFUSES, Finding, Subject
 from projservo_cli.records import TOOL, WORLD
+from projservo_cli.words import values
 
 VIEWS = ("left", "right", "top", "far side")
 COUNTED = Finding(
@@ -27,7 +28,7 @@ def finding(code, joint_unit):
 def test_each_finding_has_words_whatever_the_arm_and_the_cameras(code):
     for mount, count, unit in itertools.product((WORLD, TOOL), (1, 2, 3, 4), ("rad", "m")):
         one = finding(code, unit)
-        setup = words.Setup(mount, VIEWS[:count], 1 if count == 1 else 6)
+        setup = values.Setup(mount, VIEWS[:count], 1 if count == 1 else 6)
         if code in DEVIATIONS:
             one = Finding(**vars(one) | {"others": (finding("joint_step", unit), finding("base", unit))})
         for text in (words.line(one, setup), words.limit(one, setup)):
@@ -45,7 +46,7 @@ def test_each_finding_has_words_whatever_the_arm_and_the_cameras(code):
 def test_deviations_name_what_else_explains_the_images():
     one = finding("scale", "rad")
     one = Finding(**vars(one) | {"others": (finding("joint_step", "rad"), finding("base", "rad"))})
-    line = words.line(one, words.Setup())
+    line = words.line(one, values.Setup())
     assert "(or step of joint 2, or motion of the base or the cameras: the images do not tell); fit" in line
     assert line.startswith("joint 2 moves 2 % ± 0.1 % more than it reads")
 
@@ -56,7 +57,7 @@ def test_joints_that_are_alike_share_a_line():
         for i in (1, 2)
     ]
     one = Finding("little_motion", LIMITS, Subject(joints=(4,)), 0.01, limit=0.05, unit="m")
-    together = words.lines([*few, one], words.Setup())
+    together = words.lines([*few, one], values.Setup())
     assert together == (
         "joints 1, 2 and 4 moved only 2.86°, 2.86° and 10 mm: move each at least 11.5°, 22.9° and 50 mm",
     )
@@ -66,11 +67,11 @@ def test_a_refusal_names_its_cause_first_and_a_hint_last():
     cause = Finding("joint_type", REFUSES, Subject(joints=(2,), name="RPR"), unit="m")
     misfit = Finding("misfit", REFUSES, Subject(name="views"), 3.0, limit=0.5, unit="px")
     hint = finding("sag", "rad")
-    text = words.refused([cause, misfit], words.Setup())
+    text = words.refused([cause, misfit], values.Setup())
     assert text.startswith("by the images joint 2 is prismatic, not revolute: check the types of joints, ")
     assert "(RPR would fit); as given, the fit does not describe the data: residuals of 3 px a" in text
     assert text.endswith(
         "are 6 times the 0.5 px that the epipolar geometry shows; check the joint readings, "
         "their units and types, and the marker numbers"
     )
-    assert "; the residuals look as if joint 2 sags" in words.refused([misfit, hint], words.Setup())
+    assert "; the residuals look as if joint 2 sags" in words.refused([misfit, hint], values.Setup())

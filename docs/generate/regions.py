@@ -18,7 +18,8 @@ from projservo_cli.config.schema import json_schema, sweep_schema
 from projservo_cli.findings import DEVIATIONS, LIMITS, NOTE, Finding, Subject
 from projservo_cli.loop import verdicts as loop_verdicts
 from projservo_cli.sweeps.runs import ALL_VERDICTS, BETWEEN, NUMBERED, measured_columns
-from projservo_cli.words import ROWS, Setup, line, sentence
+from projservo_cli.words import ROWS, line, sentence
+from projservo_cli.words.values import Setup
 
 # Where a run file holds which record.
 GROUPS = {

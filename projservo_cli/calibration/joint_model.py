@@ -29,7 +29,7 @@ from projservo_cli.records import (
     JointCurve,
     WorkFailed,
 )
-from projservo_cli.words import quantity
+from projservo_cli.words.values import quantity
 
 # Functions of each kind; those of a coupling read another joint.
 _FUNCTIONS = {

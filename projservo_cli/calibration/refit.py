@@ -56,7 +56,8 @@ from projservo_cli.records import (
     WorkFailed,
     apart,
 )
-from projservo_cli.words import quantity, with_findings
+from projservo_cli.words import with_findings
+from projservo_cli.words.values import quantity
 
 # Minimum number of detections: a camera has 11 numbers, and as many are left to judge them.
 _LEAST = 12

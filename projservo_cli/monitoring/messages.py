@@ -6,7 +6,7 @@ import numpy as np
 
 from projservo_cli.monitoring.hypotheses import ALL, Explanation
 from projservo_cli.records import CORNERS, TOOL, WORLD, Calibration, FloatArray
-from projservo_cli.words import joined
+from projservo_cli.words.values import joined
 
 # By so much a link may flex under its load, rad, which looks like a joint that slipped.
 _FLEXIBLE = np.radians(1.0)

@@ -21,7 +21,7 @@ from projservo_cli.report.report_data import (
     curve_difference,
     percent,
 )
-from projservo_cli.words import joined
+from projservo_cli.words.values import joined
 
 
 class _Claim(NamedTuple):

@@ -41,7 +41,8 @@ from projservo_cli.stages.stage_inputs import (
     Trials,
 )
 from projservo_cli.store.observation_tables import mount_in, read_detections, read_table, to_csv
-from projservo_cli.words import Setup, lines, with_findings
+from projservo_cli.words import lines, with_findings
+from projservo_cli.words.values import Setup
 
 _Calibrated = tuple[Observation, Calibration, CrossValidation | None]
 

@@ -1,0 +1,146 @@
+"""Sentences on findings: the only place that knows the words for them, units, numbers and mounts.
+
+A row of ``ROWS`` belongs to each code. Its texts are formats of ``values.VALUES``.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from itertools import groupby
+from typing import Any
+
+from projservo_cli.findings import DEVIATIONS, LIMITS, NOTE, REFUSES, Finding, columns, first, usable
+from projservo_cli.records import TOOL, Calibration
+from projservo_cli.words import calibrations
+from projservo_cli.words.rows import Row
+from projservo_cli.words.values import Setup, Told, quantity
+
+# Maximum number of deviations from the model in advice.
+_MAX_NAMED = 3
+ROWS: dict[str, Row] = calibrations.OF_MODEL | calibrations.CALIBRATION | calibrations.REFUSALS
+_CAUSES = ("other_mount", "images_before_readings", "images_after_readings", "joint_type", "standing_joint")
+# Findings of which one line names all that are alike.
+_TOGETHER = ("placeholders", "hopeless_joint", "joint_together", "joint_in_few_poses", "little_motion")
+# Those that the reason of a calibration or its stated error says, and advice does not repeat.
+_OF_REASON = ("noise", "residuals", "closed_form", "joint_noise", "deviations", "unshown")
+
+
+def limit(one: Finding, setup: Setup) -> str:
+    """Return what a finding limits predictions by, after "limited by"."""
+    return _row(one, setup).limit.format_map(_told([one], setup))
+
+
+def sentence(one: Finding, setup: Setup) -> str:
+    """Return the sentence on a finding, without its remedy."""
+    return _sentence([one], setup)
+
+
+def line(one: Finding, setup: Setup) -> str:
+    """Return the sentence on a finding and its remedy."""
+    return _line([one], setup)
+
+
+def lines(findings: Iterable[Finding], setup: Setup) -> tuple[str, ...]:
+    """Return a line on each finding, one for all joints that are alike."""
+    groups = groupby(findings, key=lambda one: one.code if one.code in _TOGETHER else id(one))
+    return tuple(_line(list(group), setup) for _, group in groups)
+
+
+def reason(findings: Sequence[Finding], setup: Setup) -> str:
+    """Return why a calibration is usable or not: its residuals, and what limits it."""
+    about, *rest = findings
+    text = sentence(about, setup)
+    if about.code == "closed_form":
+        return f"{text}: {_row(about, setup).remedy}"
+    if about.code == "told" and first(rest, REFUSES) is None:
+        return text
+    text += "".join(f", with {sentence(one, setup)}" for one in rest if one.code == "joint_noise")
+    cause = _cause(findings)
+    text += f"; limited by {limit(cause, setup)}"
+    if cause.code in DEVIATIONS:
+        together = next((one for one in rest if one.code == "deviations"), cause)
+        text += f", which moves predictions by {quantity(together.effect_px, 'px')}"
+        if cause.severity == REFUSES:
+            text += f", more than calibration.max_predicted_px = {together.limit:.3g}"
+    return text
+
+
+def advice(findings: Iterable[Finding], setup: Setup) -> tuple[str, ...]:
+    """Return what to do about a calibration, a line each, of deviations from the model the largest."""
+    told = [one for one in findings if one.code not in _OF_REASON]
+    least = [one for one in told if one.code in DEVIATIONS][_MAX_NAMED:]
+    return lines((one for one in told if one not in least), setup)
+
+
+def refused(findings: Sequence[Finding], setup: Setup) -> str:
+    """Return why data make no calibration: a cause that would explain them, the misfit, and a hint."""
+    told, words = list(findings), ""
+    while told and told[0].code in _CAUSES and len(told) > 1:
+        words += f"{line(told.pop(0), setup)}; as given, "
+    main, *hints = told
+    words += sentence(main, setup) if hints and main.code == "misfit" else line(main, setup)
+    for hint in hints:
+        look = f"the residuals look as if {sentence(hint, setup)}"
+        words += f"; {look if hint.code in DEVIATIONS else line(hint, setup)}"
+    return words
+
+
+def judged(findings: Iterable[Finding], setup: Setup) -> dict[str, Any]:
+    """Return the fields of a calibration that follow from findings, the first on its residuals."""
+    about, *rest = findings
+    found = (about, *sorted(rest, key=lambda one: one.severity == NOTE))
+    return columns(found) | {
+        "usable": usable(found),
+        "reason": reason(found, setup),
+        "advice": advice(found, setup),
+        "limit": limit(_cause(found), setup),
+        "notes": advice((one for one in found if one.severity == NOTE), setup),
+        "findings": found,
+    }
+
+
+def with_findings(
+    calibration: Calibration, more: Iterable[Finding], ahead: Iterable[Finding] = ()
+) -> Calibration:
+    """Return a calibration with further findings, those ``ahead`` before its own, judged by all."""
+    about, *rest = calibration.findings
+    return replace(calibration, **judged((about, *ahead, *rest, *more), setup_of(calibration)))
+
+
+def order_advice(calibration: Calibration) -> str:
+    """Return the line on joints whose order nothing shows; empty if there are none, or it was not tested."""
+    return "".join(line(one, setup_of(calibration)) for one in calibration.open_order)
+
+
+def setup_of(calibration: Calibration) -> Setup:
+    """Return the arm and the cameras of a calibration."""
+    return Setup(calibration.mount, calibration.view, len(calibration.joint_types))
+
+
+def _cause(findings: Sequence[Finding]) -> Finding:
+    """Return the finding that limits predictions most: one that refuses, else the first that limits."""
+    about, *rest = findings
+    limiting = [one for one in rest if ROWS[one.code].limit]
+    return first(limiting, REFUSES) or first(limiting, LIMITS) or about
+
+
+def _row(one: Finding, setup: Setup) -> Row:
+    return (calibrations.ON_THE_TOOL if setup.mount == TOOL else {}).get(one.code, ROWS[one.code])
+
+
+def _told(alike: Sequence[Finding], setup: Setup) -> Told:
+    return Told(alike, setup, sentence)
+
+
+def _line(alike: list[Finding], setup: Setup) -> str:
+    remedy = _row(alike[0], setup).remedy.format_map(_told(alike, setup))
+    text = _sentence(alike, setup)
+    return text + (("; " if ": " in text else ": ") + remedy if remedy else "")
+
+
+def _sentence(alike: list[Finding], setup: Setup) -> str:
+    one = alike[0]
+    text = _row(one, setup).sentence.format_map(_told(alike, setup))
+    if one.code in DEVIATIONS and one.others:
+        others = ", or ".join(limit(other, setup) for other in one.others)
+        text += f" (or {others}: the images do not tell)"
+    return text

@@ -1,0 +1,229 @@
+"""Values of which words for findings consist, by the names that the texts of rows have for them."""
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from projservo_cli.findings import Finding, Subject
+from projservo_cli.records import TOOL, VIEWS, WORLD
+
+# Maximum number of names in a list of examples, and of runs of poses.
+_EXAMPLES, _MAX_RUNS = 3, 4
+_UNITS = {
+    "px": (1.0, " px"),
+    "rad": (float(np.degrees(1.0)), "°"),
+    "m": (1e3, " mm"),
+    "s": (1.0, " s"),
+    "1": (1.0, ""),
+    "": (1.0, ""),
+}
+_ORIGINS = {
+    "given": "that were given",
+    "stated": "that the sigmas of the markers state",
+    "views": "that the epipolar geometry shows",
+    "body": "that a rigid body shows",
+    "stated, by views": "that the sigmas of the markers state, times {amount:.3g} as both views show",
+    "stated, by body": "that the sigmas of the markers state, times {amount:.3g} as a rigid body shows",
+}
+
+
+class Setup(NamedTuple):
+    """An arm and its cameras, as far as words depend on them."""
+
+    mount: str = WORLD
+    view: Sequence[str] = VIEWS
+    joints: int = 6  # number of the joints
+
+
+class Told:
+    """Findings that one line tells, the first for all; values are looked up as in a dictionary."""
+
+    def __init__(
+        self, alike: Sequence[Finding], setup: Setup, sentence: Callable[[Finding, Setup], str]
+    ) -> None:
+        self.alike, self.setup, self.one, self.sentence = alike, setup, alike[0], sentence
+        self.joints = [joint for each in alike for joint in each.subject.joints]
+
+    def __getitem__(self, name: str) -> object:
+        return VALUES[name](self)
+
+    @property
+    def subject(self) -> Subject:
+        """Of the first."""
+        return self.one.subject
+
+    @property
+    def single(self) -> bool:
+        """Whether it is about one joint."""
+        return len(self.joints) == 1
+
+    @property
+    def alone(self) -> bool:
+        """Whether the arm has one joint."""
+        return self.setup.joints == 1
+
+    @property
+    def many(self) -> bool:
+        """Whether the amount, a count, is not one."""
+        return self.one.amount != 1.0
+
+    @property
+    def rest(self) -> Finding:
+        """What the first consists of, else itself."""
+        return self.one.others[0] if self.one.others else self.one
+
+
+def quantity(value: float, unit: str, digits: int = 3) -> str:
+    """Format a number of a unit, angles in degrees and lengths in mm."""
+    factor, name = _UNITS[unit]
+    return f"{factor * value:.{digits}g}{name}"
+
+
+def joined(words: Iterable[object]) -> str:
+    """Join words by commas, the last by "and"."""
+    told = [*map(str, words)]
+    return " and ".join(filter(None, (", ".join(told[:-1]), *told[-1:])))
+
+
+def _joints(told: Told) -> str:
+    everything = told.one.code == "scale" and not told.single
+    return "all joints" if everything else numbered("joint", told.joints)
+
+
+def _leads(told: Told) -> str:
+    """Say what a start leads to that was not used."""
+    if math.isnan(told.one.amount):
+        cameras = "both cameras" if len(told.setup.view) == 2 else told["all_cameras"]
+        return f"does not put the markers in front of {cameras}"
+    return f"leads to residuals of {told['amount']} instead of {told['limit']}"
+
+
+def _stands(alike: Sequence[Finding]) -> str:
+    """Say in how many rows numbers stand that no camera saw, the most frequent first."""
+    several = "several markers and poses", "several poses of one marker"
+    each = [
+        f"{one.subject.name} stands in {one.amount:.0f} rows of {several[len(one.subject.markers) == 1]}"
+        for one in alike[:_EXAMPLES]
+    ]
+    more = [f"{len(alike) - _EXAMPLES} further numbers"] * (len(alike) > _EXAMPLES)
+    return "; ".join([*each, *more])
+
+
+def _scale(one: Finding) -> float:
+    """Factor of stated deviations that the images show."""
+    return next((other.amount for other in one.others), 1.0)
+
+
+def _of_images(others: Sequence[Finding]) -> str:
+    """Say how many images of all, and of each view, were numbered from another end."""
+    each = ", ".join(
+        f"{one.subject.views[0]} {one.amount:.0f} of {one.limit:.0f}" for one in others if one.limit
+    )
+    turned, seen = (sum(getattr(one, name) or 0.0 for one in others) for name in ("amount", "limit"))
+    return f"{turned:.0f} of {seen:.0f} images number it from another end ({each})"
+
+
+def _band(others: Sequence[Finding]) -> str:
+    """Noise of images and joints, and the band in which χ² per degree of freedom is expected."""
+    noise, band, *joints = others
+    of_joints = "".join(f" and {quantity(one.amount, 'rad')} rms of joint noise" for one in joints)
+    within = f"expected within {band.amount:.4g} and {band.limit:.4g}"
+    return f"{quantity(noise.amount, 'px', 6)} of noise{of_joints}, {within}"
+
+
+def _size(one: Finding) -> str:
+    """Format an amount with its deviation, shares in %."""
+    factor, unit = (100.0, " %") if one.unit == "1" else _UNITS[one.unit]
+    spread = f" ± {factor * one.deviation:.1g}{unit}" if one.deviation > 0.0 else ""
+    return f"{factor * abs(one.amount):.2g}{unit}{spread}"
+
+
+def numbered(kind: str, numbers: Sequence[int]) -> str:
+    """Name things of a kind by their numbers."""
+    return f"{kind}{'s' * (len(numbers) > 1)} {joined(numbers)}"
+
+
+def examples(numbers: Sequence[int]) -> str:
+    """List the first of some numbers, and say how many more there are."""
+    more = f" and {len(numbers) - _EXAMPLES} more" if len(numbers) > _EXAMPLES else ""
+    return ", ".join(map(str, numbers[:_EXAMPLES])) + more
+
+
+def _runs(ends: Sequence[int]) -> str:
+    """List runs of poses by the first and the last of each."""
+    runs = [" to ".join(map(str, dict.fromkeys(ends[i : i + 2]))) for i in range(0, len(ends), 2)]
+    return ", ".join(runs[:_MAX_RUNS]) + (
+        f" and {len(runs) - _MAX_RUNS} more" if len(runs) > _MAX_RUNS else ""
+    )
+
+
+def _shared(others: Sequence[Finding]) -> str:
+    """Say which marker, pose or view most outliers share."""
+    for one in others:
+        subject, most = one.subject, "all" if one.limit == one.amount else f"{one.amount:.0f}"
+        for kind, values in (("marker", subject.markers), ("pose", subject.poses), ("view", subject.views)):
+            if values:
+                return f", {most} of {kind} {values[0]}"
+    return ""
+
+
+VALUES: dict[str, Callable[[Told], object]] = {
+    # Of the subject.
+    "of": lambda told: told.subject.joints,
+    "name": lambda told: told.subject.name,
+    "mount": lambda told: told.subject.name,
+    "joints": _joints,
+    "it": lambda told: "it" if told.single else "each",
+    "moves": lambda told: "moves" if told.single else "move",
+    "reads": lambda told: "it reads" if told.single else "they read",
+    "all_cameras": lambda told: "the camera" if len(told.setup.view) == 1 else "all cameras",
+    "view": lambda told: told.subject.views[0] if told.subject.views else "",
+    "other_view": lambda told: told.subject.views[-1] if told.subject.views else "",
+    "in_view": lambda told: f" in the {told.subject.views[0]} view" if told.subject.views else "",
+    "markers": lambda told: "the markers" if told.subject.tag is None else f"tag {told.subject.tag}",
+    "numbers": lambda told: examples(told.subject.markers),
+    "begin": lambda told: f" at pose {told.subject.poses[0]}" if told.subject.poses else "",
+    "poses": lambda told: examples(told.subject.poses),
+    "runs": lambda told: _runs(told.subject.poses),
+    "s": lambda told: "s" if len(set(told.subject.poses)) > 1 else "",
+    "there": lambda told: "on the tool" if told.subject.name == TOOL else "fixed",
+    # Of amounts.
+    "more": lambda told: "less" if told.one.amount < 0.0 else "more" if told.single else "more or less",
+    "size": lambda told: _size(told.one),
+    "amount": lambda told: joined([quantity(each.amount, each.unit) for each in told.alike]),
+    "limit": lambda told: joined([quantity(each.limit, each.unit) for each in told.alike]),
+    "number": lambda told: f"{told.one.limit:.3g}",
+    "ratio": lambda told: f"{told.one.amount / told.one.limit:.3g}" if told.one.limit else "",
+    "percent": lambda told: f"{100.0 * told.one.amount:.0f}",
+    "effect": lambda told: quantity(told.one.effect_px, "px"),
+    "fits": lambda told: "prismatic" if told.one.unit == "m" else "revolute",
+    "given": lambda told: "revolute" if told.one.unit == "m" else "prismatic",
+    "origin": lambda told: _ORIGINS.get(told.subject.name, "").format(amount=_scale(told.one)),
+    "chi": lambda told: f"{told.one.amount:.4g}",
+    "chi2": lambda told: _band(told.one.others),
+    "check_noise": lambda told: "check joint_noise_deg" if len(told.one.others) > 2 else "",
+    "leads": _leads,
+    "ticks": lambda told: " (ticks that were counted)" if told.subject.name == "ticks" else "",
+    # Of counts.
+    "count": lambda told: f"{told.one.amount:.0f}",
+    "total": lambda told: f"{told.one.limit:.0f}",
+    "observations": lambda told: "observations were" if told.many else "observation was",
+    "outliers": lambda told: "outliers" if told.many else "an outlier",
+    "disagree": lambda told: "readings disagree" if told.many else "reading disagrees",
+    "times": lambda told: f"{told.one.amount:.0f} times" if told.many else "once",
+    "stands": lambda told: _stands(told.alike),
+    "shared": lambda told: _shared(told.one.others),
+    "of_images": lambda told: _of_images(told.one.others),
+    # Of what it consists of.
+    "unshown": lambda told: ", ".join(told.sentence(other, told.setup) for other in told.one.others),
+    "rest": lambda told: f"{told.rest.amount:.0f}",
+    "of_rest": lambda told: f"{told.rest.limit:.0f}",
+    "part": lambda told: quantity(told.rest.amount, told.rest.unit),
+    "of_part": lambda told: quantity(told.rest.limit, told.rest.unit),
+    # Of arms of one joint, and of several.
+    "elsewhere": lambda told: "markers farther from its axis" if told.alone else "trials of every joint",
+    "by_itself": lambda told: "" if told.alone else f" in which {told['it']} moves alone",
+    "only": lambda told: "" if told.alone else " alone",
+}
