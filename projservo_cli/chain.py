@@ -29,6 +29,8 @@ from projservo_cli.result_hashes import digest
 from projservo_cli.settings.task import TaskStep
 from projservo_cli.stages.stage_inputs import CarryingObject, PlanInputs, ServoInputs
 from projservo_cli.store.run_file import SERVO, Run, save
+from projservo_cli.words import line
+from projservo_cli.words.values import Setup
 
 if TYPE_CHECKING:
     from projservo_cli.robots.session import Session
@@ -213,11 +215,13 @@ class Chain:
                     "objects.max_displacement_m is not compared, since no length on the tool is known: set "
                     "markers.positions_m, markers.tag_size_m or markers.board.size_m"
                 )
-            if (why := too_far(plan, carrier)) and not self.confirm:
-                self._fail(motion, why)
+            if (far := too_far(plan, carrier)) is None:
+                continue
+            why = line(far, Setup())
+            if not self.confirm:
+                self._fail(motion, WorkFailed(why, findings=[far]))
                 return False
-            if why:
-                self.listener.say(why)
+            self.listener.say(why)
         if self.confirm:
             if self.config.steps:
                 self.listener.say(f"servo: one after the other: {', '.join(self.config.steps)}")

@@ -819,6 +819,10 @@ class Plan(CarriedByObject, JointSpaceSearch, TaskPartition, PlannedMotion):
         "constraints hold; in the profile joint_space, whether a path was found"
     )
     reason: str = _scalar(about="reason why the plan is feasible or not")
+    findings: tuple[Finding, ...] = _scalar(
+        about="what holds or is off: code, severity, subject, amount, deviation, limit, unit, effect",
+        default=(),
+    )
     tau: float = _scalar(about="amplitude of the translation, unit-norm kernel of (8)")
     theta_r: float = _scalar("rad", "angle onto the target plane, in the sense chosen")
     theta_p: float = _scalar("rad", "angle within the plane")

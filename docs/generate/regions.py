@@ -19,6 +19,7 @@ from projservo_cli.findings import DEVIATIONS, LIMITS, NOTE, Finding, Subject
 from projservo_cli.loop import verdicts as loop_verdicts
 from projservo_cli.sweeps.runs import ALL_VERDICTS, BETWEEN, NUMBERED, measured_columns
 from projservo_cli.words import ROWS, line, sentence
+from projservo_cli.words.plans import PLANS
 from projservo_cli.words.values import Setup
 
 # Where a run file holds which record.
@@ -137,18 +138,38 @@ def example(code: str) -> Finding:
     texts, counted = "".join(ROWS[code]), ("{count}", "{total}", "{times}")
     of_joints = ("joint", "quadratic", "cubic", "harmonic", "sag", "little", "circular", "turned")
     unit, amount, limit, deviation = "px", 0.6, 0.2, 0.1
-    if any(name in texts for name in counted):
+    of_path = ("margin_joints", "motion_joints", "object_far")
+    if code in PLANS and code not in of_path and not any(name in texts for name in counted):
+        pixels = code in ("motion_border", "outside_image") or code.startswith("margin_")
+        unit, amount, limit = "px" if pixels else "1", 0.06, 0.05
+    elif any(name in texts for name in counted):
         unit, amount, limit = "1", 12.0, 400.0
     elif code in ("scale", "coupling") or "{percent}" in texts:
         unit, amount, deviation = "1", 0.02, 0.001
     elif any(word in code for word in of_joints):
         unit, amount, deviation, limit = "rad", 0.0349, 0.00175, 0.2
     names = {"unused_start": "arm.json", "rejected_poses": "first", "placeholders": "u = 9999"}
+    names |= dict.fromkeys(("rejected_profile", "face_turned"), "linear") | {"object_far": "tray"}
+    names |= dict.fromkeys(("relaxed", "within_region"), "start")
     names |= {"other_mount": "tool", "joint_type": "RPR", "whole_seconds": "t_q"}
     joints = (2, 3) if code in ("coupling", "undecided_order") else (2,)
     subject = Subject(joints, ("left", "right"), (5, 6), None, (7, 9), names.get(code, "views"))
     of_part = Subject(views=("left",)) if code == "turned_board" else Subject(markers=(5,))
     others = (Finding("noise", NOTE, of_part, 9.0, limit=12.0, unit="1"),) * 2
+    if code in ("relaxed", "no_path", "start_beyond"):
+        others = (
+            Finding("margin_image", subject=Subject(views=("left",)), amount=3.0, limit=8.0, unit="px"),
+        )
+    elif code == "rejected_profile":
+        others = (Finding("no_coupled_path"),)
+    elif code in PLANS:
+        at = (("mu_t", 0.8), ("mu_r", 0.5), ("mu_p", 0.5))
+        share = {"joint_path": 2.0, "goals_hidden": 3.0, "unknown_image_size": 640.0}.get(code, 0.5)
+        parts = (Finding("share", subject=Subject(views=("left",)), amount=share, limit=480.0, unit="1"),)
+        moved = (Finding("share", subject=Subject(name=name), amount=amount) for name, amount in at)
+        others = tuple(moved) if "{at}" in texts else parts
+        if code == "motion_joints":
+            others = (Finding("range", amount=-0.785, limit=0.035, unit="rad"), *others)
     if code == "unshown":
         others = (Finding("sag", subject=Subject(joints=(3,)), amount=0.01, unit="rad"),)
     return Finding(code, LIMITS, subject, amount, deviation, limit, unit, 1.5, others)

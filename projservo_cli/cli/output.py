@@ -319,9 +319,11 @@ def _of_plan(value: dict[str, Any], detailed: bool) -> Iterator[str]:
     yield wrapped(f"plan: {value['profile']}, {feasible}: {value['reason']}")
     for one in value["objects"].values():
         yield wrapped(one["reason"], "  ")
-    profiles = [text if detailed else ": ".join(text.split(": ")[:2]) for text in value["rejected_profiles"]]
-    if profiles:
-        yield wrapped("; ".join(f"not {text}" for text in profiles), "  ")
+    rejected = [one for one in value["findings"] if one["code"] == "rejected_profile"]
+    if rejected and not detailed:
+        yield wrapped(f"not {', '.join(one['subject']['name'] for one in rejected)}; why: -v", "  ")
+    for text in value["rejected_profiles"] if detailed else ():
+        yield wrapped(f"not {text}", "  ")
     for text in value["relaxed_constraints"]:
         yield wrapped(text, "  ")
     if detailed:

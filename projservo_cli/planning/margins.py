@@ -69,29 +69,21 @@ def column(kind: int, views: int) -> int:
     return 1 + (kind - FRONT) * views if kind >= FRONT else 0
 
 
-class _Words(NamedTuple):
-    """Name of a constraint and of its value in its own unit; phrases take a joint's number or a view."""
+class _Named(NamedTuple):
+    """Name of a constraint and of its value in its own unit."""
 
     name: str
     value: str
-    stops: str  # names what stops a search
-    asked: str  # names its required value
 
 
 CONSTRAINTS = {
-    JOINTS: _Words("joints", "joints", "the limits of joint {}", "limit of joint {}"),
-    FRONT: _Words("front", "front", "a marker behind the {} camera", "depth before the {} camera"),
-    VISIBILITY: _Words(
-        "visibility", "visibility", "the face edge-on to the {} camera", "visibility from the {} camera"
-    ),
-    WIDTH: _Words(
-        "width", "width_px", "the width of the face in the {} image", "width of the face in the {} image"
-    ),
-    IMAGE: _Words("image", "border_px", "the border of the {} image", "border in the {} image"),
-    CLEAR: _Words("clear", "clear_px", "a region that is kept out of", "distance from regions"),
-    CONDITIONING: _Words(
-        "conditioning", "condition", "dependent operators", "reciprocal condition of the image Jacobian"
-    ),
+    JOINTS: _Named("joints", "joints"),
+    FRONT: _Named("front", "front"),
+    VISIBILITY: _Named("visibility", "visibility"),
+    WIDTH: _Named("width", "width_px"),
+    IMAGE: _Named("image", "border_px"),
+    CLEAR: _Named("clear", "clear_px"),
+    CONDITIONING: _Named("conditioning", "condition"),
 }
 # Constraints of a motion of the face, in the order of its margins.
 OF_MOTION = (VISIBILITY, IMAGE, JOINTS, CONDITIONING)
@@ -102,8 +94,8 @@ def columns(kind: int, views: int) -> slice:
     return slice(column(kind, views), column(kind + 1, views))
 
 
-def constraint_at(margin: int, views: int) -> tuple[_Words, int]:
-    """Return the words of a column of margins, and its view if each camera has its own."""
+def constraint_at(margin: int, views: int) -> tuple[_Named, int]:
+    """Return the names of a column of margins, and its view if each camera has its own."""
     kind = max(kind for kind in CONSTRAINTS if column(kind, views) <= margin)
     return CONSTRAINTS[kind], margin - column(kind, views)
 

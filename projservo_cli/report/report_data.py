@@ -484,6 +484,7 @@ def _plan(run: Run) -> dict[str, Any]:
         | angles
         | {
             "objects": objects,
+            "findings": [one.plain() for one in plan.findings],
             "tau_0": plan.tau_0,
             "smallest_margin": plan.margin.min(axis=0),
             "margins": {name: {"min": lowest, "mu": mu} for name, lowest, mu in nearest},

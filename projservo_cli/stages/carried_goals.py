@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from projservo_cli.calibration.prediction import error_factor_with_model, require_covariance
+from projservo_cli.findings import REFUSES, Finding, Subject
 from projservo_cli.metric.frame import Metric, Scale
 from projservo_cli.records import Calibration, CarriedByObject, InputError, Plan, WorkFailed
 from projservo_cli.robots.contract import Reading
@@ -97,21 +98,22 @@ def carried_goal(
     return scenario.carried(found_now["s_carried"]), found_now
 
 
-def too_far(plan: Plan, carrier: CarryingObject | None) -> str:
-    """Return why somebody should look before a robot goes to a carried goal; empty if that is not needed."""
+def too_far(plan: Plan, carrier: CarryingObject | None) -> Finding | None:
+    """Return why somebody should look before a robot goes to a carried goal; None if that is not needed."""
     if carrier is None:
-        return ""
-    shift, limits = plan.object_shift_mm, carrier.limits
-    for at, most, unit, key in (
-        (shift and 1e-3 * shift, limits.max_displacement_m, "m", "max_displacement_m"),
-        (plan.object_angle_deg, limits.max_rotation_deg, "deg", "max_rotation_deg"),
+        return None
+    limits, subject = carrier.limits, Subject(name=carrier.name)
+    for at, most, unit in (
+        (plan.object_shift_mm and 1e-3 * plan.object_shift_mm, limits.max_displacement_m, "m"),
+        (
+            plan.object_angle_deg and math.radians(plan.object_angle_deg),
+            math.radians(limits.max_rotation_deg),
+            "rad",
+        ),
     ):
         if at is not None and at > most:
-            return (
-                f"objects.{carrier.name} has moved by {at:.3g} {unit}, more than {most:g}: look whether the "
-                f"goal is free there, then confirm it (--confirm), or raise objects.{key}"
-            )
-    return ""
+            return Finding("object_far", REFUSES, subject, at, limit=most, unit=unit)
+    return None
 
 
 def _known(number: float) -> float | None:

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from projservo_cli.findings import REFUSES, Finding, Subject, usable
 from projservo_cli.geometry.algebra import as_array
 from projservo_cli.geometry.kinematics import forward, forward_kinematics, project
 from projservo_cli.geometry.lens import undistort
@@ -34,9 +35,9 @@ from projservo_cli.planning.rrt_connect import (
     within_region,
 )
 from projservo_cli.planning.time_parameterization import TimedPath, joints_at, minimum_time
-from projservo_cli.records import LIMITS_MISSING, NO_SPREAD, FloatArray, Model, Plan, Spread, WorkFailed
+from projservo_cli.records import NO_SPREAD, FloatArray, Model, Plan, Spread, WorkFailed
 from projservo_cli.settings.task import Trajectory
-from projservo_cli.stages.plan_summary import sight_words, verdict_of
+from projservo_cli.stages.plan_summary import sight_of, verdict_of
 from projservo_cli.stages.scenario import Scenario
 from projservo_cli.task.body import SETTLED, fit_body
 from projservo_cli.task.face import Task
@@ -50,10 +51,9 @@ class Found(NamedTuple):
     judged: Motion  # where the constraints were looked at
     motion: Motion  # as it is stored, at the instants sigma
     time: FloatArray  # (s,) when it is there, s; NaN where nothing limits the speed
-    feasible: bool
-    reason: str  # feasible, reason: whether it may be followed; a path has its own reason
+    findings: tuple[Finding, ...]  # whether it may be followed; a path has its own
     path: JointPath | None = None  # through joint space, if one was searched
-    entered: str = ""  # which region it enters that is kept out of, in words
+    entered: Finding | None = None  # the region that it enters and is to keep out of
 
 
 def coupled(reaching: Reaching, trajectory: Trajectory) -> Found:
@@ -63,9 +63,9 @@ def coupled(reaching: Reaching, trajectory: Trajectory) -> Found:
     motion = along_shares(judged.reaching, evenly(judged, sigma))
     if judged.holds() and not motion.holds():  # between the places that were looked at
         judged = motion
-    feasible, _, reason = verdict_of(judged)
-    reason = reason if feasible else f"no path was found that keeps all constraints; {reason}"
-    return Found(judged, motion, _timed(sigma * duration(judged), sigma, trajectory), feasible, reason)
+    _, nearest = verdict_of(judged)
+    found = (nearest,) if usable([nearest]) else (Finding("no_coupled_path", REFUSES), nearest)
+    return Found(judged, motion, _timed(sigma * duration(judged), sigma, trajectory), found)
 
 
 def by_profile(
@@ -77,7 +77,7 @@ def by_profile(
     speed = reaching.demands.limits.speed
     shortest = minimum_time(speed, motion.along.q) if np.isfinite(speed).any() else np.nan * sigma
     time = _timed(shortest, sigma, trajectory)
-    return Found(motion, motion, time, *sight_words(profile, motion))
+    return Found(motion, motion, time, (sight_of(profile, motion),))
 
 
 class JointSearch(NamedTuple):
@@ -86,7 +86,7 @@ class JointSearch(NamedTuple):
     goal_joints: FloatArray  # (k, n) joints known to show the goal, rad or m
     sigma: float  # standard deviation of a coordinate of the images of the goal, px
     spread: Spread = NO_SPREAD  # how far predictions err
-    closed: str = ""  # reason why no path can be searched
+    closed: Finding | None = None  # why no path can be searched
 
 
 def search_of(scenario: Scenario) -> JointSearch:
@@ -103,19 +103,18 @@ def search_of(scenario: Scenario) -> JointSearch:
             scenario.inputs.trajectory.search.seed,
             scenario.least_views,
         )
-    limits, closed = scenario.joints.limits, ""
-    if scenario.truth is None and not (np.isfinite(limits.lower) & np.isfinite(limits.upper)).all():
-        closed = f"the limits of some joints are unknown: {LIMITS_MISSING}"
+    limits = scenario.joints.limits
+    known = scenario.truth is not None or np.isfinite([limits.lower, limits.upper]).all()
+    closed = None if known else Finding("unknown_limits", REFUSES)
     return JointSearch(scenario.joints_at_goal, scenario.goal_sigma_px, spread, closed)
 
 
-def why_closed(model: Model, demands: Demands, search: JointSearch | None) -> str:
-    """Return the reason why no path through joint space can be searched or timed; empty if it can."""
+def why_closed(model: Model, demands: Demands, search: JointSearch | None) -> Finding | None:
+    """Return the reason why no path through joint space can be searched or timed; None if it can."""
     for i in np.flatnonzero(~np.isfinite(demands.limits.speed)):
-        kind = "prismatic" if model.prismatic[i] else "joint"
-        unit = "m_s" if kind == "prismatic" else "deg_s"
-        return f"joint {i + 1} has no speed limit: set control.{kind}_speed_limit_{unit}"
-    return "no search was given" if search is None else search.closed
+        unit = "m" if model.prismatic[i] else "rad"
+        return Finding("no_speed_limit", REFUSES, Subject(joints=(int(i) + 1,)), unit=unit)
+    return Finding("no_search", REFUSES) if search is None else search.closed
 
 
 def _timed(shortest: FloatArray, sigma: FloatArray, trajectory: Trajectory) -> FloatArray:
@@ -180,23 +179,23 @@ def _joint_constraints(reaching: Reaching, task: Task, trajectory: Trajectory, s
     return c._replace(spread=spread)
 
 
-def _entered(c: Constraints, q: FloatArray) -> str:
-    """Which region the body enters along joints (s, n), in words; empty where it keeps out of all."""
+def _entered(c: Constraints, q: FloatArray) -> Finding | None:
+    """Return the region that the body enters along joints (s, n); None where it keeps out of all."""
     if not np.isfinite(q).all():
-        return "no joints can follow the motion, so that it cannot be kept out of regions"
+        return Finding("not_followed", REFUSES)
     for end, joints in (("start", q[0]), ("goal", q[-1])):
         if region := within_region(c, joints):
-            return f"the {end} is within region {region} of trajectory.keep_out"
+            return Finding("within_region", REFUSES, Subject(name=end), region)
     last, region = first_within(c, q)
-    at = f"at path parameter {last / (len(q) - 1):.2f}"
-    return f"the body enters region {region} of trajectory.keep_out {at}" if region else ""
+    at = (Finding("share", amount=last / (len(q) - 1)),)
+    return Finding("enters_region", REFUSES, amount=region, others=at) if region else None
 
 
 def kept_out(found: Found, task: Task, trajectory: Trajectory, spread: Spread) -> Found:
     """Return the motion, infeasible if it enters a keep-out region of the body."""
     c = _joint_constraints(found.motion.reaching, task, trajectory, spread)
     entered = _entered(c, found.motion.along.q)
-    return found._replace(feasible=False, reason=entered, entered=entered) if entered else found
+    return found if entered is None else found._replace(findings=(entered,), entered=entered)
 
 
 def joint_path(reaching: Reaching, task: Task, trajectory: Trajectory, search: JointSearch) -> Found:
@@ -212,13 +211,13 @@ def joint_path(reaching: Reaching, task: Task, trajectory: Trajectory, search: J
         q, unknown = np.full_like(linear.motion.along.q, np.nan), np.full(trajectory.n_samples, np.nan)
         still = linear.motion.along._replace(q=q, limit=unknown, condition=unknown)
         motion = linear.motion._replace(along=still)
-        return Found(linear.judged, motion, unknown, False, "", path)
+        return Found(linear.judged, motion, unknown, (), path)
     motion = _sampled_path(reaching, path.timing, trajectory.n_samples)
     min_duration = float(path.timing.time[-1])
     asked = min_duration if trajectory.duration_s is None else trajectory.duration_s
     _require_time(asked, min_duration)
     time = np.linspace(0.0, asked, len(motion.mu))
-    return Found(motion, motion, time, True, "", path)
+    return Found(motion, motion, time, (), path)
 
 
 def _sampled_path(reaching: Reaching, timed: TimedPath, samples: int) -> Motion:

@@ -1,7 +1,7 @@
 """Stage plan: the task's partition, where the face stays visible, and a motion that keeps it so."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -9,6 +9,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from projservo_cli.control.law import State
+from projservo_cli.findings import LIMITS, NOTE, Finding, Subject, usable
 from projservo_cli.geometry.algebra import as_array, vec
 from projservo_cli.geometry.displacements import composed_angle
 from projservo_cli.geometry.kernels import COORDINATES, RANK_TOLERANCE
@@ -48,7 +49,7 @@ from projservo_cli.stages.motions import (
     search_of,
     why_closed,
 )
-from projservo_cli.stages.plan_summary import reason_of, search_summary, verdict_of
+from projservo_cli.stages.plan_summary import findings_on, relaxed, search_summary, verdict_of
 from projservo_cli.stages.scenario import Scenario, scenario_of
 from projservo_cli.stages.stage_inputs import PlanInputs
 from projservo_cli.task.face import Task, center_of, face_plane
@@ -61,21 +62,22 @@ from projservo_cli.task.visibility import (
     visibility_angles,
     visibility_translation,
 )
-from projservo_cli.words import order_advice
+from projservo_cli.words import line, lines, setup_of, text
+from projservo_cli.words.values import Setup
 
 
 def _partitioned(
     model: Model, images: TaskImages, trajectory: Trajectory, limits: JointLimits
-) -> tuple[State, Task, Parts, str]:
+) -> tuple[State, Task, Parts, bool]:
     """Measure and partition the task at its start; half turns are rehearsed within joint limits.
 
     Returns the state with face and joint motions, the task in the frame of the model, translation and
-    rotations, a half turn in the sense that was rehearsed, and what to say of the rehearsal.
+    rotations, a half turn in the sense that was rehearsed, and whether it arrived.
     """
     task, seen = images.task(model), undistort(model.lens, images.s_start)
     bounds = limits if trajectory.rehearses else None
     state, parts, arrives = begin(model, task, seen, images.q_start, bounds)
-    return state, task, parts, "" if arrives else "; neither sense of the half turn arrived when rehearsed"
+    return state, task, parts, arrives
 
 
 def _joint_motions(state: State) -> FloatArray:
@@ -145,13 +147,13 @@ def run(
         scenario, carried = carried_goal(scenario, inputs.carrier, before, session)
     plan = _to_any_goal(scenario) if inputs.incidences else _plan_in(scenario)
     face = metric_points(scenario.model, calibration.M[calibration.indices_of(inputs.face)])
-    notes = [
-        plan.reason,
-        order_advice(calibration),
-        _borders(inputs, calibration.view),
-        "" if face is None else _uneven(face),
-    ]
-    return replace(plan, reason="; ".join(filter(None, notes)), **carried)
+    further = (
+        *calibration.open_order,
+        *_borders(inputs, calibration.view),
+        *(() if face is None else _uneven(face)),
+    )
+    reason = "; ".join((plan.reason, *lines(further, setup_of(calibration))))
+    return replace(plan, reason=reason, findings=plan.findings + further, **carried)
 
 
 def _plan_in(scenario: Scenario) -> Plan:
@@ -204,27 +206,19 @@ def _to_any_goal(scenario: Scenario) -> Plan:
     return plans[-1] if plans[-1].feasible else plans[0]
 
 
-def _borders(inputs: PlanInputs, view: Sequence[str]) -> str:
-    """Tell which borders images of an unknown size are taken to have; empty where the size is known."""
-    if inputs.image_size is not None:
-        return ""
-    sizes = ["x".join(f"{side:.0f}" for side in one) for one in image_sizes(inputs.seen_px, view)]
-    told = " and ".join(f"{size} {name}" for size, name in zip(sizes, view, strict=True))
-    return (
-        f"the size of the images is not known: they are taken to reach to the last pixels seen, {told}; "
-        f"give it: --image-size, or size_px of {'both' if len(view) == 2 else 'all'} cameras"
-    )
+def _borders(inputs: PlanInputs, view: Sequence[str]) -> Iterator[Finding]:
+    """Tell which borders images of an unknown size are taken to have."""
+    if inputs.image_size is None:
+        sizes = zip(image_sizes(inputs.seen_px, view).tolist(), view, strict=True)
+        each = (Finding("size", subject=Subject(views=(name,)), amount=w, limit=h) for (w, h), name in sizes)
+        yield Finding("unknown_image_size", LIMITS, others=tuple(each))
 
 
-def _uneven(face: FloatArray) -> str:
-    """Say that markers (m, 3) of a face are off the plane that motions take it for; else empty."""
+def _uneven(face: FloatArray) -> Iterator[Finding]:
+    """Tell how far markers (m, 3) of a face are off the plane that motions take it for."""
     size = np.linalg.svd(face - face.mean(axis=0))[1]
-    if (share := size[2] / size[0]) <= _UNEVEN:
-        return ""
-    return (
-        f"the face is not plane: its markers are {100.0 * share:.2g} % of its size off ({100.0 * _UNEVEN:g} "
-        "% are allowed), and visibility is that of a plane between them: name others in markers.face"
-    )
+    if (share := float(size[2] / size[0])) > _UNEVEN:
+        yield Finding("uneven_face", LIMITS, amount=share, limit=_UNEVEN)
 
 
 def _require_taught_since(scenario: Scenario, calibration: Calibration) -> None:
@@ -313,23 +307,33 @@ def plan_task(
     """
     if trajectory.profile != "auto":
         return _planned(model, images, trajectory, demands, search)[0]
-    before: list[str] = []
+    before: list[tuple[str, Finding]] = []
     shut = why_closed(model, demands, search)
     for profile in ("linear", "constrained", "joint_space"):
         asked = trajectory.model_copy(update={"profile": profile})
-        last = profile == "joint_space" or (profile == "constrained" and bool(shut))
+        last = profile == "joint_space" or (profile == "constrained" and shut is not None)
         try:
             plan, fails = _planned(model, images, asked, demands, search)
         except WorkFailed as error:
             if last:
                 raise
-            before.append(f"{profile}: {error}")
+            before.append((profile, Finding("told", subject=Subject(name=str(error)))))
             continue
-        if not fails or last:
-            after = [] if profile == "joint_space" or not fails else [f"joint_space: {shut}"]
-            return replace(plan, rejected_profiles=(*before, *after))
-        before.append(f"{profile}: {fails}")
+        if fails is None or last:
+            if shut is not None and fails is not None and profile != "joint_space":
+                before.append(("joint_space", shut))
+            rejected = tuple(
+                Finding("rejected_profile", NOTE, Subject(name=name), others=(why,)) for name, why in before
+            )
+            words = lines(rejected, _setup(images))
+            return replace(plan, rejected_profiles=words, findings=plan.findings + rejected)
+        before.append((profile, fails))
     raise AssertionError(before)
+
+
+def _setup(images: TaskImages) -> Setup:
+    """Return the arm and the cameras of a task."""
+    return Setup(view=images.view, joints=len(images.q_start))
 
 
 def _found(
@@ -343,14 +347,14 @@ def _found(
     profile = trajectory.profile
     if profile == "joint_space":
         shut = why_closed(reaching.model, reaching.demands, search)
-        if search is None or shut:
-            raise InputError(f"the profile joint_space: {shut}")
+        if search is None or shut is not None:
+            raise InputError(f"the profile joint_space: {'' if shut is None else line(shut, Setup())}")
         return joint_path(reaching, task, trajectory, search)
     if profile == "constrained":
         found = coupled(reaching, trajectory)
     else:
         found = by_profile(profile, reaching, trajectory, pure)
-    if trajectory.keep_out and found.feasible:
+    if trajectory.keep_out and usable(found.findings):
         found = kept_out(found, task, trajectory, NO_SPREAD if search is None else search.spread)
     return found
 
@@ -370,10 +374,10 @@ def _planned(
     trajectory: Trajectory,
     demands: Demands,
     search: JointSearch | None,
-) -> tuple[Plan, str]:
-    """Return the plan of one profile, and the constraints that fail, in words; empty if all hold."""
+) -> tuple[Plan, Finding | None]:
+    """Return the plan of one profile, and the first constraint that fails; None if all hold."""
     face = images.by_points()
-    state, task, parts, note = _partitioned(model, images, trajectory, demands.limits)
+    state, task, parts, arrives = _partitioned(model, images, trajectory, demands.limits)
     H_hat = np.array([as_array(H) for H in (parts.H_t, parts.H_r, parts.H_p)])
     a, amplitudes = np.array(parts.a), np.array([parts.tau, parts.theta_r, parts.theta_p])
     tau_0, theta_0 = _changes(a, H_hat, task)
@@ -402,12 +406,18 @@ def _planned(
     if len(images.q_start) < COORDINATES and path is None:
         _require_in_span(model, state.A, images.q_start, along.s)
     sense, sense_margin = _senses(parts, task)
-    holds, constraint, words = verdict_of(found.judged)
+    constraint, nearest = verdict_of(found.judged)
+    about = found.findings if path is None else (findings_on(path, images.view),)
+    if path is None and not arrives:
+        about += (Finding("half_turn", LIMITS),)
+    ends = () if path is None or path.timing is None else tuple(relaxed(path, along.q, images.view))
     min_margin, min_margin_mu = _minimum_of(found.judged)
     plan = Plan(
         profile=trajectory.profile,
-        feasible=found.feasible,
-        reason=found.reason + note if path is None else reason_of(path, images.view),
+        feasible=usable(about),
+        reason=text(about, _setup(images)),
+        findings=about + ends,
+        relaxed_constraints=lines(ends, _setup(images)),
         view=images.view,
         tau=tau,
         theta_r=theta_r,
@@ -447,9 +457,10 @@ def _planned(
         theta_0=theta_0,
         sense=sense,
         sense_margin=sense_margin,
-        **({} if path is None else search_summary(path, along.q, time, trajectory.search.seed, images.view)),
+        **({} if path is None else search_summary(path, along.q, time, trajectory.search.seed)),
     )
-    return plan, found.entered or ("" if holds or (path is not None and found.feasible) else words)
+    holds = usable([nearest]) or (path is not None and plan.feasible)
+    return plan, found.entered or (None if holds else nearest)
 
 
 def _changes(a: FloatArray, H_hat: FloatArray, task: Task) -> tuple[FloatArray, FloatArray]:

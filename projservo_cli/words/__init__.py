@@ -11,12 +11,13 @@ from typing import Any
 from projservo_cli.findings import DEVIATIONS, LIMITS, NOTE, REFUSES, Finding, columns, first, usable
 from projservo_cli.records import TOOL, Calibration
 from projservo_cli.words import calibrations
+from projservo_cli.words.plans import PLANS
 from projservo_cli.words.rows import Row
 from projservo_cli.words.values import Setup, Told, quantity
 
 # Maximum number of deviations from the model in advice.
 _MAX_NAMED = 3
-ROWS: dict[str, Row] = calibrations.OF_MODEL | calibrations.CALIBRATION | calibrations.REFUSALS
+ROWS: dict[str, Row] = calibrations.OF_MODEL | calibrations.CALIBRATION | calibrations.REFUSALS | PLANS
 _CAUSES = ("other_mount", "images_before_readings", "images_after_readings", "joint_type", "standing_joint")
 # Findings of which one line names all that are alike.
 _TOGETHER = ("placeholders", "hopeless_joint", "joint_together", "joint_in_few_poses", "little_motion")
@@ -43,6 +44,11 @@ def lines(findings: Iterable[Finding], setup: Setup) -> tuple[str, ...]:
     """Return a line on each finding, one for all joints that are alike."""
     groups = groupby(findings, key=lambda one: one.code if one.code in _TOGETHER else id(one))
     return tuple(_line(list(group), setup) for _, group in groups)
+
+
+def text(findings: Iterable[Finding], setup: Setup) -> str:
+    """Return the lines on findings as one text."""
+    return "; ".join(lines(findings, setup))
 
 
 def reason(findings: Sequence[Finding], setup: Setup) -> str:
@@ -128,7 +134,7 @@ def _row(one: Finding, setup: Setup) -> Row:
 
 
 def _told(alike: Sequence[Finding], setup: Setup) -> Told:
-    return Told(alike, setup, sentence)
+    return Told(alike, setup, sentence, limit)
 
 
 def _line(alike: list[Finding], setup: Setup) -> str:

@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from projservo_cli.findings import Finding, Subject
-from projservo_cli.records import TOOL, VIEWS, WORLD
+from projservo_cli.findings import NOTE, Finding, Subject
+from projservo_cli.records import LIMITS_MISSING, TOOL, VIEWS, WORLD
 
 # Maximum number of names in a list of examples, and of runs of poses.
 _EXAMPLES, _MAX_RUNS = 3, 4
@@ -41,9 +41,14 @@ class Told:
     """Findings that one line tells, the first for all; values are looked up as in a dictionary."""
 
     def __init__(
-        self, alike: Sequence[Finding], setup: Setup, sentence: Callable[[Finding, Setup], str]
+        self,
+        alike: Sequence[Finding],
+        setup: Setup,
+        sentence: Callable[[Finding, Setup], str],
+        limit: Callable[[Finding, Setup], str],
     ) -> None:
-        self.alike, self.setup, self.one, self.sentence = alike, setup, alike[0], sentence
+        self.alike, self.setup, self.one = alike, setup, alike[0]
+        self.sentence, self.limit = sentence, limit
         self.joints = [joint for each in alike for joint in each.subject.joints]
 
     def __getitem__(self, name: str) -> object:
@@ -169,6 +174,14 @@ def _shared(others: Sequence[Finding]) -> str:
     return ""
 
 
+def _enough_see(told: Told) -> str:
+    """Say how many cameras see the face that are to; ``limit`` is their number."""
+    least, cameras = told.one.limit, len(told.setup.view)
+    if least < cameras:
+        return f"{least:.0f} of {cameras} cameras see"
+    return {1: "the camera sees", 2: "both cameras see"}.get(cameras, f"all {cameras} cameras see")
+
+
 VALUES: dict[str, Callable[[Told], object]] = {
     # Of the subject.
     "of": lambda told: told.subject.joints,
@@ -222,6 +235,29 @@ VALUES: dict[str, Callable[[Told], object]] = {
     "of_rest": lambda told: f"{told.rest.limit:.0f}",
     "part": lambda told: quantity(told.rest.amount, told.rest.unit),
     "of_part": lambda told: quantity(told.rest.limit, told.rest.unit),
+    # Of plans.
+    "nearest": lambda told: "all constraints hold; nearest is " if told.one.severity == NOTE else "",
+    "fails": lambda told: "" if told.one.severity == NOTE else " fails first",
+    "at": lambda told: (
+        "at "
+        + ", ".join(f"{one.subject.name} {one.amount:.2f}" for one in told.one.others if one.code == "share")
+    ),
+    "enough_see": _enough_see,
+    "enough": lambda told: "both cameras" if len(told.setup.view) == 2 else "enough cameras",
+    "both": lambda told: "both" if len(told.setup.view) == 2 else "all",
+    "since": lambda told: ", ".join(
+        f"{one.subject.views[0]} from path parameter {one.amount:.2f}" for one in told.one.others
+    ),
+    "stops": lambda told: ", ".join(told.limit(one, told.setup) for one in told.one.others),
+    "speed_limit": lambda told: {"m": "prismatic_speed_limit_m_s"}.get(
+        told.one.unit, "joint_speed_limit_deg_s"
+    ),
+    "set_limits": lambda _: LIMITS_MISSING,
+    "of_percent": lambda told: f"{100.0 * told.one.limit:g}",
+    "sizes": lambda told: joined(
+        f"{one.amount:.0f}x{one.limit:.0f} {one.subject.views[0]}" for one in told.one.others
+    ),
+    "key": lambda told: {"m": "max_displacement_m"}.get(told.one.unit, "max_rotation_deg"),
     # Of arms of one joint, and of several.
     "elsewhere": lambda told: "markers farther from its axis" if told.alone else "trials of every joint",
     "by_itself": lambda told: "" if told.alone else f" in which {told['it']} moves alone",
