@@ -436,7 +436,7 @@ def sweep(
         run_sweep(design, folder, Engine(workers), listener.progress, say, force=begin)
         table, names = SweepTable(folder.table), dict(named)
         for law, failure in table.failures.items():
-            listener.say(f"law {names.get(law, law)}: {failure.words(law)}")
+            listener.say(f"law {names.get(law, law)}: {failure.words}")
         study = Study(table, names)
     study.path = None if path is None else folder.table
     return study

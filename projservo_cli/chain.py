@@ -30,12 +30,12 @@ from projservo_cli.settings.task import TaskStep
 from projservo_cli.stages.stage_inputs import CarryingObject, PlanInputs, ServoInputs
 from projservo_cli.store.run_file import SERVO, Run, save
 from projservo_cli.words import line
-from projservo_cli.words.values import Setup
+from projservo_cli.words.runs import arrived, meaning
+from projservo_cli.words.table import Setup
 
 if TYPE_CHECKING:
     from projservo_cli.robots.session import Session
 
-_STOPPED = ("failed", "object moved")  # verdicts after which nothing is driven
 FIGURES = "figures"  # folder of a run in which a killed report may have left something
 
 
@@ -189,9 +189,9 @@ class Chain:
                 name = step.name.removeprefix(SERVO)
                 self.laws_done += (name,)
                 trace = self.run.traces[name]
-                if trace.verdict in _STOPPED and not step.part:  # nor is it driven by the next law
+                if meaning(trace.verdict).ends and not step.part:  # nor is it driven by the next law
                     self._fail(step, trace.reason)
-                elif trace.verdict != "converged" and step.part:  # nor are the next steps made
+                elif not arrived(trace.verdict) and step.part:  # nor are the next steps made
                     self._fail(step, f"ended in {trace.verdict}: {trace.reason}")
                 elif self.session is not None and (lost := self.session.lost):
                     self._fail(step, lost)
@@ -347,8 +347,8 @@ class Chain:
         required = self.config.control.must_converge
         failed = self.failed.removeprefix(SERVO)  # is printed last
         for trace in (self.run.traces[law] for law in self.laws_done if law != failed):
-            must, converged = must_converge(trace.law, required), trace.verdict == "converged"
-            if trace.verdict in _STOPPED or (converged and not trace.overruns):
+            must, converged = must_converge(trace.law, required), arrived(trace.verdict)
+            if meaning(trace.verdict).ends or (converged and not trace.overruns):
                 continue
             but = " must converge, but" if must and not converged else ""
             reason = " ".join(trace.reason.split())
@@ -360,7 +360,7 @@ class Chain:
                     "many do, raise control.period_s, or find fewer markers"
                 )
             # Classical laws lead where nothing can be expected of them, images included.
-            disturbed = trace.verdict == "fault detected" and trace.law not in POINT_LAWS
+            disturbed = meaning(trace.verdict).refutes and trace.law not in POINT_LAWS
             yield _Shortfall(text, fatal=not converged and (must or disturbed))
 
     def _keep(self, run: Run) -> None:
@@ -386,7 +386,7 @@ class Chain:
             refuted = ""
         elif step.law and not self.config.plant.simulated:
             trace = result.records[""]
-            refuted = trace.reason if trace.verdict == "fault detected" else ""
+            refuted = trace.reason if meaning(trace.verdict).refutes else ""
         self._keep(replace(run, results={**results, step.name: result}, refuted=refuted))
         if after:
             self.listener.say(f"{', '.join(after)}: dropped, their inputs were replaced")

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from projservo_cli.findings import Finding
 from projservo_cli.records import FARTHEST_M, TWO_TURNS, VIEWS, FloatArray, InputError
 from projservo_cli.result_hashes import File
 
@@ -82,6 +83,8 @@ def plain(value: Any, *, finite: bool = False) -> Any:
 
     finite : strict JSON, with None in place of NaN and infinity.
     """
+    if isinstance(value, Finding):
+        value = value.plain()
     if hasattr(value, "tolist"):  # of NumPy
         value = value.tolist()
     if isinstance(value, (list, tuple)):

@@ -27,6 +27,7 @@ from projservo_cli.result_hashes import key_of
 from projservo_cli.robots.source import source_hash
 from projservo_cli.settings.task import TaskStep
 from projservo_cli.store.run_file import SERVO, Result, Run
+from projservo_cli.words.runs import meaning
 
 # The stages in their order, and what makes the record that each is given.
 _INPUTS: dict[str, Callable[[Config, Files | None], Any]] = {
@@ -249,7 +250,7 @@ def _reason(step: Step, run: Run, forced: bool, remade: bool) -> str:
         law = f"source of {law_and_mode(step.law)[0]}"
         other = step.law and stored.inputs.get(law) != step.inputs.get(law)
         return "the source of its law changed" if other else "outdated"
-    if step.law and stored.records[""].verdict == "failed":
+    if step.law and meaning(stored.records[""].verdict).retried:
         return "failed before"
     if remade:
         return "its inputs are made again"

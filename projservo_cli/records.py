@@ -1024,6 +1024,9 @@ class Trace(RecordedFrames, RunHistory, RunMetrics):
     planned_s: float | None = _scalar("s", "arrival of the followed plan; none for regulate")
     verdict: str = _scalar(about="verdict of the run")
     reason: str = _scalar(about="reason of the verdict, one sentence")
+    findings: tuple[Finding, ...] = _scalar(
+        about="reasons: code, severity, subject, amount, deviation, limit, unit, effect", default=()
+    )
     steps: int = _scalar(about="commands sent")
     period: float = _scalar("s", "control period")
     features: str = _scalar(about="image features: points or body")

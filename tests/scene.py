@@ -11,7 +11,7 @@ from projservo_cli.geometry.lens import distort
 from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.laws import CODES, INCIDENCES
 from projservo_cli.loop.compiled import Course, run_compiled
-from projservo_cli.loop.verdicts import VERDICTS, Limits, new_log
+from projservo_cli.loop.verdicts import VERDICT_NAMES, Limits, new_log
 from projservo_cli.records import FloatArray, Model, position_limits
 from projservo_cli.simulation.analytic_plant import Plant
 from projservo_cli.task.body import make_body
@@ -123,6 +123,6 @@ class Run:
         course = Course(scene.plant, bounds, scene.q_start.copy())
         built_in = make_law(CODES[law], scene.seen(G), task, gains)
         self.code, self.steps = run_compiled(built_in, course, noise, self.state, self.full)
-        self.verdict = VERDICTS[self.code] if self.code >= 0 else None
+        self.verdict = VERDICT_NAMES[self.code] if self.code >= 0 else None
         self.log = type(self.full)(*(rows[: self.steps + 1] for rows in self.full[:-4]), *self.full[-4:])
         self.center = (self.log.H @ np.array(center_of(scene.plant.M, scene.plant.center)))[:, :3]

@@ -8,7 +8,7 @@ import pytest
 from projservo_cli import words
 from projservo_cli.findings import DEVIATIONS, LIMITS, REFUSES, Finding, Subject
 from projservo_cli.records import TOOL, WORLD
-from projservo_cli.words import values
+from projservo_cli.words import table
 
 VIEWS = ("left", "right", "top", "far side")
 COUNTED = Finding(
@@ -20,7 +20,8 @@ def finding(code, joint_unit):
     """A finding with all that its words may name."""
     unit = {"scale": "1", "coupling": "1"}.get(code, joint_unit if "joint" in code else "px")
     joints = (3, 2) if code == "coupling" else (2,)
-    subject = Subject(joints, ("left", "right"), (5, 6), None, (7, 9), "arm.json")
+    name = "singular" if code.startswith("replanned") else "arm.json"
+    subject = Subject(joints, ("left", "right"), (5, 6), 3, (7, 9), name)
     return Finding(code, LIMITS, subject, 0.02, 0.001, 0.5, unit, 1.5, (COUNTED, COUNTED, COUNTED))
 
 
@@ -28,7 +29,7 @@ def finding(code, joint_unit):
 def test_each_finding_has_words_whatever_the_arm_and_the_cameras(code):
     for mount, count, unit in itertools.product((WORLD, TOOL), (1, 2, 3, 4), ("rad", "m")):
         one = finding(code, unit)
-        setup = values.Setup(mount, VIEWS[:count], 1 if count == 1 else 6)
+        setup = table.Setup(mount, VIEWS[:count], 1 if count == 1 else 6)
         if code in DEVIATIONS:
             one = Finding(**vars(one) | {"others": (finding("joint_step", unit), finding("base", unit))})
         for text in (words.line(one, setup), words.limit(one, setup)):
@@ -46,7 +47,7 @@ def test_each_finding_has_words_whatever_the_arm_and_the_cameras(code):
 def test_deviations_name_what_else_explains_the_images():
     one = finding("scale", "rad")
     one = Finding(**vars(one) | {"others": (finding("joint_step", "rad"), finding("base", "rad"))})
-    line = words.line(one, values.Setup())
+    line = words.line(one, table.Setup())
     assert "(or step of joint 2, or motion of the base or the cameras: the images do not tell); fit" in line
     assert line.startswith("joint 2 moves 2 % ± 0.1 % more than it reads")
 
@@ -57,7 +58,7 @@ def test_joints_that_are_alike_share_a_line():
         for i in (1, 2)
     ]
     one = Finding("little_motion", LIMITS, Subject(joints=(4,)), 0.01, limit=0.05, unit="m")
-    together = words.lines([*few, one], values.Setup())
+    together = words.lines([*few, one], table.Setup())
     assert together == (
         "joints 1, 2 and 4 moved only 2.86°, 2.86° and 10 mm: move each at least 11.5°, 22.9° and 50 mm",
     )
@@ -67,11 +68,23 @@ def test_a_refusal_names_its_cause_first_and_a_hint_last():
     cause = Finding("joint_type", REFUSES, Subject(joints=(2,), name="RPR"), unit="m")
     misfit = Finding("misfit", REFUSES, Subject(name="views"), 3.0, limit=0.5, unit="px")
     hint = finding("sag", "rad")
-    text = words.refused([cause, misfit], values.Setup())
+    text = words.refused([cause, misfit], table.Setup())
     assert text.startswith("by the images joint 2 is prismatic, not revolute: check the types of joints, ")
     assert "(RPR would fit); as given, the fit does not describe the data: residuals of 3 px a" in text
     assert text.endswith(
         "are 6 times the 0.5 px that the epipolar geometry shows; check the joint readings, "
         "their units and types, and the marker numbers"
     )
-    assert "; the residuals look as if joint 2 sags" in words.refused([misfit, hint], values.Setup())
+    assert "; the residuals look as if joint 2 sags" in words.refused([misfit, hint], table.Setup())
+
+
+def test_cameras_without_a_marker_are_named_by_their_number():
+    for view, dark, told in [
+        (("top",), ("top",), "the top camera shows no marker"),
+        (VIEWS[:2], ("left",), "the left camera shows no marker"),
+        (VIEWS[:2], VIEWS[:2], "neither camera shows a marker"),
+        (VIEWS[:3], ("left", "top"), "none of the cameras left, top shows a marker"),
+        (VIEWS[:3], VIEWS[:3], "no camera shows a marker"),
+    ]:
+        one = Finding("unseen_markers", subject=Subject(views=dark))
+        assert words.sentence(one, table.Setup(view=view)) == f"{told} of the calibration"

@@ -17,10 +17,11 @@ from projservo_cli.cli.equations import REGISTER
 from projservo_cli.config.schema import json_schema, sweep_schema
 from projservo_cli.findings import DEVIATIONS, LIMITS, NOTE, Finding, Subject
 from projservo_cli.loop import verdicts as loop_verdicts
-from projservo_cli.sweeps.runs import ALL_VERDICTS, BETWEEN, NUMBERED, measured_columns
+from projservo_cli.sweeps.runs import BETWEEN, NUMBERED, measured_columns
 from projservo_cli.words import ROWS, line, sentence
 from projservo_cli.words.plans import PLANS
-from projservo_cli.words.values import Setup
+from projservo_cli.words.runs import VERDICTS
+from projservo_cli.words.table import Setup
 
 # Where a run file holds which record.
 GROUPS = {
@@ -128,7 +129,12 @@ def sweep_columns() -> Iterator[str]:
 
 def verdicts() -> Iterator[str]:
     """All verdicts of a run, and their order."""
-    yield ", ".join(f"`{verdict}`" for verdict in ALL_VERDICTS) + "."
+    rows = []
+    for name, one in VERDICTS.items():
+        after = "another path is searched" if one.stopped else ""
+        after = "nothing is driven" if one.ends else after
+        rows.append((f"`{name}`", text(one.when), text(one.remedy), after))
+    yield from table(("verdict", "cause", "remedy", "then"), rows)
     yield ""
     yield from python.markdown(inspect.cleandoc(loop_verdicts.__doc__ or "").split("\n\n", 1)[1])
 
@@ -151,6 +157,7 @@ def example(code: str) -> Finding:
     names = {"unused_start": "arm.json", "rejected_poses": "first", "placeholders": "u = 9999"}
     names |= dict.fromkeys(("rejected_profile", "face_turned"), "linear") | {"object_far": "tray"}
     names |= dict.fromkeys(("relaxed", "within_region"), "start")
+    names |= {"replanned": "joint limit", "replanned_in_vain": "ahead", "moved_object": "tray"}
     names |= {"other_mount": "tool", "joint_type": "RPR", "whole_seconds": "t_q"}
     joints = (2, 3) if code in ("coupling", "undecided_order") else (2,)
     subject = Subject(joints, ("left", "right"), (5, 6), None, (7, 9), names.get(code, "views"))

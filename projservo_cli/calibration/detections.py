@@ -29,7 +29,8 @@ from projservo_cli.records import (
     WorkFailed,
     prismatic_of,
 )
-from projservo_cli.words.values import Setup, quantity
+from projservo_cli.words.table import Setup
+from projservo_cli.words.values import quantity
 
 # Difference, rad or m, below which two joint readings are equal: far below any encoder's resolution.
 _SAME_READING = 1e-7

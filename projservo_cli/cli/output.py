@@ -319,9 +319,9 @@ def _of_plan(value: dict[str, Any], detailed: bool) -> Iterator[str]:
     yield wrapped(f"plan: {value['profile']}, {feasible}: {value['reason']}")
     for one in value["objects"].values():
         yield wrapped(one["reason"], "  ")
-    rejected = [one for one in value["findings"] if one["code"] == "rejected_profile"]
+    rejected = [one.subject.name for one in value["findings"] if one.code == "rejected_profile"]
     if rejected and not detailed:
-        yield wrapped(f"not {', '.join(one['subject']['name'] for one in rejected)}; why: -v", "  ")
+        yield wrapped(f"not {', '.join(rejected)}; why: -v", "  ")
     for text in value["rejected_profiles"] if detailed else ():
         yield wrapped(f"not {text}", "  ")
     for text in value["relaxed_constraints"]:

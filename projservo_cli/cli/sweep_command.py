@@ -70,7 +70,7 @@ def _sweep(
             console.say(f"{folder.table}: the runs done so far; the same command goes on with the others")
             raise
         for law, failure in SweepTable(folder.table).failures.items():
-            console.say(f"law {law}: {failure.words(law)}")
+            console.say(f"law {law}: {failure.words}")
     table = folder.table.resolve() if folder.table.exists() else None
     value = {
         "sweep": folder.path.resolve(),

@@ -14,16 +14,16 @@ from typing import Protocol
 
 import numpy as np
 
+from projservo_cli.findings import NOTE, Finding, Subject
 from projservo_cli.loop.python import BuiltInLaw
 from projservo_cli.loop.stall_monitor import StallMonitor
 from projservo_cli.loop.verdicts import (
     CONVERGED,
     DIVERGED,
-    JOINT_LIMIT,
     MARKERS_LOST,
     NO_PROGRESS,
     RUNNING,
-    SINGULAR_VERDICT,
+    VERDICT_NAMES,
     WAITING,
     Limits,
     Log,
@@ -31,13 +31,12 @@ from projservo_cli.loop.verdicts import (
 )
 from projservo_cli.records import FloatArray, Plan
 from projservo_cli.task.face import Task
+from projservo_cli.words.runs import VERDICTS
 
 # Periods between checks of the path ahead, by the mean offset of the images in the last ones.
 _EVERY, _LAST = 10, 5
 # Senses along a path.
 _BACK, _ON = -1, 1
-# What stops a law.
-_STOPPED = {JOINT_LIMIT: "a joint limit", SINGULAR_VERDICT: "a singularity", DIVERGED: "growing errors"}
 
 
 class _Replanner(Protocol):
@@ -53,6 +52,11 @@ class _Replanner(Protocol):
         """Plan of a path from joints (n,), off by (V, 2) px, to other goals than those excluded (k, n)."""
 
 
+def _stopped(verdict: int) -> bool:
+    """Whether a verdict of the loop stopped a law for which another path is searched."""
+    return verdict >= 0 and bool(VERDICTS[VERDICT_NAMES[verdict]].stopped)
+
+
 class ExecutionMonitor:
     """Monitor of a built-in law that follows a plan.
 
@@ -61,7 +65,7 @@ class ExecutionMonitor:
     limits : of the run.
     stall : monitor of a robot that may lag behind its set-points; None for one that does not.
     blind : whether the robot may move on where the face is lost.
-    ``attempts``: why a path was searched again each time, and when, in words.
+    ``attempts``: why a path was searched again each time, and when.
     """
 
     def __init__(
@@ -77,7 +81,7 @@ class ExecutionMonitor:
     ) -> None:
         self.law, self.follow, self.replanner = law, follow, replanner
         self.left, self.limits = searches, limits
-        self.attempts: list[str] = []
+        self.attempts: list[Finding] = []
         self._stall, self._may_pass = stall, blind
         self._excluded: list[FloatArray] = []
         self._blind = 0  # sense in which the robot passes along the path where the face is lost; 0 if seen
@@ -96,9 +100,8 @@ class ExecutionMonitor:
         if self._blind and verdict == RUNNING:
             sense, self._blind = self._blind, 0
             if sense == _BACK:
-                what = "the face was lost, and seen again on the path backwards"
-                return self._replanned(log, k, verdict, what)
-            self.attempts.append(f"passed over where the face is lost to step {k}")
+                return self._replanned(log, k, verdict, "face_back")
+            self.attempts.append(Finding("passed_over", NOTE, amount=k, unit="1"))
             return verdict
         path, clock = self.law.law.task.reference.q, float(self.law.state.clock[0])
         if clock < len(path) - 1:
@@ -106,10 +109,11 @@ class ExecutionMonitor:
                 verdict = RUNNING  # a path may lead away from the goal
             return self._on_path(log, k, verdict, path[int(clock) :])
         self._alone += 1
-        if verdict not in _STOPPED and not self._stalls(log, k, verdict):
+        if not _stopped(verdict) and not self._stalls(log, k, verdict):
             return verdict
         self._excluded += [path[-1].copy(), log.read[k].copy()]
-        return self._replanned(log, k, verdict, f"{_STOPPED.get(verdict, 'no progress')} at the goal")
+        why = VERDICT_NAMES[verdict] if _stopped(verdict) else "no progress"
+        return self._replanned(log, k, verdict, why)
 
     def _stalls(self, log: Log, k: int, verdict: int) -> bool:
         """Whether the law that ends the motion comes no nearer."""
@@ -122,11 +126,11 @@ class ExecutionMonitor:
     def _on_path(self, log: Log, k: int, verdict: int, ahead: FloatArray) -> int:
         """Return the new verdict with joints (s, n) ahead."""
         self._alone = 0
-        if verdict in _STOPPED:
-            return self._replanned(log, k, verdict, f"{_STOPPED[verdict]} on the path")
+        if _stopped(verdict):
+            return self._replanned(log, k, verdict, VERDICT_NAMES[verdict])
         checks = verdict == RUNNING and k % _EVERY == 0 and self.left > 0
         if checks and self._leaves_image(log, k, ahead):
-            return self._replanned(log, k, verdict, "the path ahead would leave an image")
+            return self._replanned(log, k, verdict, "ahead")
         return verdict
 
     def _replanned(self, log: Log, k: int, verdict: int, why: str) -> int:
@@ -138,9 +142,9 @@ class ExecutionMonitor:
         plan = self.replanner.replan(log.read[k], excluded, self._off(log, k))
         if plan is None:
             self.left = 0
-            self.attempts.append(f"at step {k} ({why}) in vain")
+            self.attempts.append(Finding("replanned_in_vain", NOTE, Subject(name=why), k, unit="1"))
             return verdict
-        self.attempts.append(f"at step {k} ({why})")
+        self.attempts.append(Finding("replanned", NOTE, Subject(name=why), k, unit="1"))
         self.law.follow(self.follow(plan))
         log.events[2] = -1.0
         self._alone = 0
@@ -162,7 +166,7 @@ class ExecutionMonitor:
             return MARKERS_LOST
         if self._waited > self.limits.max_lost_periods:
             self._blind, self._excluded = 0, [*self._excluded, path[-1].copy()]
-            return self._replanned(log, k, MARKERS_LOST, "the face is hidden at the end of the path")
+            return self._replanned(log, k, MARKERS_LOST, "goal_hidden")
         clock = min(clock, end)
         state.clock[0], state.parts[0], state.share[0], state.blocked[0] = clock, 0, -1.0, -1
         there = np.array([np.interp(clock, np.arange(len(path)), joint) for joint in path.T])

@@ -8,6 +8,7 @@ import math
 
 import numpy as np
 
+from projservo_cli.findings import LIMITS, REFUSES, Finding, Subject
 from projservo_cli.loop.verdicts import (
     CONVERGED,
     FOLLOWING_ERROR,
@@ -64,7 +65,8 @@ class StallMonitor:
         self._short: list[BoolArray] = []
         self._held: list[bool] = []  # whether the robot was held, since markers were lost
         self._more = self._looks = 0  # periods and looks that are left at the goal
-        self.reason, self.minimum = "", False
+        self.minimum = False
+        self.reason: Finding | None = None
 
     def ruled(self, log: Log, k: int, verdict: int, q_dot: FloatArray) -> int:
         """Return the new verdict; it is not asked while the arm is held.
@@ -124,46 +126,40 @@ class StallMonitor:
         short: BoolArray = np.all(self._short[-window:], axis=0) & (moved <= self._still)
         stays = (moved_since <= self._still) & (sent_since > _STAYS * np.maximum(sag, self._still)) | short
         if stays.any():
-            self._say_who_stays(stays)
+            self.reason = self._staying(stays)
             return FOLLOWING_ERROR
         if stands and (sent <= _LEAST).all():
             held = self._held[-window:]
             if np.mean(held) > _MOSTLY:
-                self.reason = (
-                    f"a marker was not seen in {sum(held)} of the last {len(held)} periods, with the robot "
-                    "held meanwhile: look at light and exposure there, or at what covers it"
-                )
+                self.reason = Finding("marker_flickers", REFUSES, amount=sum(held), limit=len(held), unit="1")
                 return MARKERS_LOST
             self.minimum = True
-            maximum = self._robot.robot.bounds.text(int(np.argmax(sent)), float(sent.max()), 2)
+            far = float(sent.max())
             self.reason = (
-                f"set-points moved by no more than {maximum}: backlash, coarse set-points or coarse "
-                "readings hide the rest"
+                Finding("coarse_motion", LIMITS, amount=far, unit=self._unit(int(np.argmax(sent))))
                 if near
-                else "the law asks for no motion there, a local minimum"
+                else Finding("local_minimum", LIMITS)
             )
             return NO_PROGRESS
         if (moved <= np.maximum(sag, self._still)).all() and idle >= _PATIENCE * window:
-            self._say_what_holds(moved_since, sent_since)
+            self.reason = self._holding(moved_since, sent_since)
             return NO_PROGRESS
         return verdict
 
-    def _say_who_stays(self, stays: BoolArray) -> None:
-        """A joint stays where it is however far its set-point goes."""
-        gap = np.abs(self._sent[-1] - self._read[-1]) * stays
-        i, text = int(np.argmax(gap)), self._robot.robot.bounds.text
-        self.reason = (
-            f"joint {i + 1} stands at {text(i, self._read[-1][i])}, {text(i, gap[i], 3)} off its set-point: "
-            "look whether it is blocked, braked or in a protective stop, or raise "
-            "plant.max_steady_state_error_deg or plant.max_relative_target_deg"
-        )
+    def _unit(self, i: int) -> str:
+        """Return the unit of joint i."""
+        return "m" if self._robot.robot.bounds.units[i : i + 1] == ("m",) else "rad"
 
-    def _say_what_holds(self, moved: FloatArray, sent: FloatArray) -> None:
-        """Return the cause of a robot that oscillates without coming nearer."""
-        i, text = int(np.argmax(sent / self._still)), self._robot.robot.bounds.text
-        amounts = f"{text(i, sent[i], 3)}, its readings by {text(i, moved[i], 3)}"
-        what = f"set-points of joint {i + 1} moved by {amounts}"
-        if moved[i] <= 0.5 * sent[i]:
-            self.reason = f"{what}: it does not follow such small steps; coarse set-points, or friction"
-        else:
-            self.reason = f"{what}, and images show no gain: backlash, or coarse set-points"
+    def _staying(self, stays: BoolArray) -> Finding:
+        """Return the joint that stays where it is however far its set-point goes."""
+        gap = np.abs(self._sent[-1] - self._read[-1]) * stays
+        i = int(np.argmax(gap))
+        at, off = float(self._read[-1][i]), float(gap[i])
+        return Finding("joint_stays", REFUSES, Subject(joints=(i + 1,)), at, limit=off, unit=self._unit(i))
+
+    def _holding(self, moved: FloatArray, sent: FloatArray) -> Finding:
+        """Return why a robot that oscillates comes no nearer."""
+        i = int(np.argmax(sent / self._still))
+        code = "small_steps" if moved[i] <= 0.5 * sent[i] else "no_gain"
+        subject, amounts = Subject(joints=(i + 1,)), (float(sent[i]), float(moved[i]))
+        return Finding(code, LIMITS, subject, amounts[0], limit=amounts[1], unit=self._unit(i))

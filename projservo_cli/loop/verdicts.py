@@ -29,26 +29,13 @@ from projservo_cli.geometry.jit import merged
 from projservo_cli.geometry.kinematics import beyond_limits, from_border
 from projservo_cli.records import VIEWS, FloatArray, IntArray
 from projservo_cli.simulation.analytic_plant import Plant
+from projservo_cli.words.runs import VERDICTS
 
 RUNNING = -1
 WAITING = -3  # for lost markers; no verdict of a run
 BEHIND_CAMERA, OUT_OF_VIEW, MARKERS_LOST, CONVERGED, DIVERGED, SINGULAR_VERDICT = range(6)
-NO_PROGRESS, MAX_STEPS, JOINT_LIMIT, FAULT_DETECTED, FAILED, FOLLOWING_ERROR = range(6, 12)
-VERDICTS = (
-    "behind camera",
-    "out of view",
-    "markers lost",
-    "converged",
-    "diverged",
-    "singular",
-    "no progress",
-    "max steps",
-    "joint limit",
-    "fault detected",
-    "failed",
-    "following error",
-    "object moved",
-)
+NO_PROGRESS, MAX_STEPS, JOINT_LIMIT, FAULT_DETECTED, FAILED, FOLLOWING_ERROR, OBJECT_MOVED = range(6, 13)
+VERDICT_NAMES = tuple(VERDICTS)
 PLATEAU_FALL = 0.01
 # Joint steps below this, rad or m, are none.
 _NO_MOTION = 1e-6

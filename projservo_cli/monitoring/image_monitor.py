@@ -8,7 +8,9 @@ import numpy as np
 
 from projservo_cli.calibration.detections import even_choice
 from projservo_cli.calibration.prediction import CAMERA, predict
+from projservo_cli.findings import REFUSES, Finding, Subject
 from projservo_cli.monitoring.accuracy import Posture
+from projservo_cli.monitoring.faults import finding_of, group_of, is_slight
 from projservo_cli.monitoring.frame_pairs import FramePair, Pairing, TimedImage, at_known_markers, mean_image
 from projservo_cli.monitoring.hypotheses import (
     Evidence,
@@ -28,7 +30,6 @@ from projservo_cli.monitoring.innovation_tests import (
     Sums,
     is_same_view,
 )
-from projservo_cli.monitoring.messages import PLACE, group_of, is_slight, sentence
 from projservo_cli.records import CORNERS, BoolArray, Calibration, FloatArray, IntArray
 
 # Markers that are tested, at most.
@@ -157,7 +158,8 @@ class ImageMonitor:
         self._crowded = 0  # observations in a row of which many detections are off by themselves
         self._forgiven: list[int] = []
         self._stated: FloatArray | None = None  # with the last frames
-        self.fault, self.agreeing = "", 0
+        self.fault: Finding | None = None
+        self.agreeing = 0
         self.unanswered = np.zeros(len(calibration.q_reference))
         self.rejected = np.zeros((views, self._all), dtype=np.bool_)
 
@@ -181,7 +183,7 @@ class ImageMonitor:
         fresh: BoolArray,
         *,
         stated: FloatArray | None = None,
-    ) -> str:
+    ) -> Finding | None:
         """Take in the newest frames of all views, and return the fault, if there is one.
 
         t : (V,) instants of the frames, s.
@@ -211,8 +213,8 @@ class ImageMonitor:
             self._take(pair)
         return self.fault
 
-    def fault_at_rest(self) -> str:
-        """Return the fault that the mean of the last observations of one posture shows; empty for none."""
+    def fault_at_rest(self) -> Finding | None:
+        """Return the fault that the mean of the last observations of one posture shows; None for none."""
         # A hand that covers a part of a view may pull the corners next to it.
         last = [tested for tested in self._kept if tested.view == self._view and not tested.covered]
         last = [tested for tested in last if np.abs(tested.pair.q - last[-1].pair.q).max() <= _AT_REST]
@@ -239,10 +241,10 @@ class ImageMonitor:
         carry = posture.carry(self.calibration.M, used)
         return self._detector.undetected(carry, self._errors.residual(pair), self._kept[-1].pair.sigma_t)
 
-    def give_up(self) -> str:
+    def give_up(self) -> Finding | None:
         """Return the fault that is pending, by the observations so far."""
         if self.pending and not self.fault:
-            self.fault = self._message(self._explanations(self._since_onset(), self._before))
+            self.fault = self._finding(self._explanations(self._since_onset(), self._before))
         return self.fault
 
     def _take(self, pair: FramePair) -> None:
@@ -324,7 +326,7 @@ class ImageMonitor:
             return
         clear = self._off >= _TWO_AT or len(_rivals(fits)) == 1
         if (explains and clear and not self._kept[-1].covered) or self._off == _NAMED_AT[-1]:
-            self.fault = self._message(fits)
+            self.fault = self._finding(fits)
 
     def _crowd_is_fault(self) -> bool:
         """Whether many detections are aside for long, and these observations together are beyond chance."""
@@ -369,7 +371,7 @@ class ImageMonitor:
                 best = self._explanations(kept, self._before)[0]
                 likely = best.score > _CLEAR and self._explains(best)
                 if likely and best.cause.kind in ("late", "frozen"):
-                    self.fault = self._message([best])
+                    self.fault = self._finding([best])
         self._off = 0
 
     def _since_onset(self) -> list[_Kept]:
@@ -483,16 +485,16 @@ class ImageMonitor:
             if lasts and best.score > _CLEAR and self._explains(best):
                 moved.append(best)
         if moved:
-            self.fault = self._message([together(moved)])
+            self.fault = self._finding([together(moved)])
 
-    def _message(self, fits: list[Explanation]) -> str:
-        """Sentence on the fault by the likeliest of causes."""
+    def _finding(self, fits: list[Explanation]) -> Finding:
+        """Return the fault with the likeliest of causes."""
         residual = self._kept[-1].residual
         square = np.square(residual.r).reshape(len(residual.seen), -1).sum(axis=1)
         rms = np.sqrt(square / np.maximum(residual.seen.sum(axis=1), 1)).max()  # of the view that is most off
-        off = f"images are {rms:.3g} px rms off their prediction by the calibration"
         if not self._explains(fits[0]):
-            return f"{off}, most {self._where(residual)}, and no single cause explains it; recalibrate"
+            off, where = float(rms), self._where(residual)
+            return Finding("unexplained_images", REFUSES, where, off, unit="px")
         # A mirrored reading near zero is a small slip: with backlash, images do not separate them.
         maximum = self._by_chance(self._evidence_now) / self._unit
         simpler = (fit for fit in fits if not fit.theta.size and contains(fits[0].cause, fit.cause))
@@ -500,15 +502,14 @@ class ImageMonitor:
         if len({tested.view for tested in self._since_onset()}) == 1:
             said += _as_rigid(fits)
         most = _MOST_NAMED_BY_ONE if len(residual.seen) == 1 else _MOST_NAMED
-        names = [sentence(fit, self.calibration) for fit in said[:most]]
-        return f"{off}: {'; or '.join(names)}"
+        causes = tuple(finding_of(fit, self.calibration) for fit in said[:most])
+        return Finding("images_off", REFUSES, amount=float(rms), unit="px", others=causes)
 
-    def _where(self, residual: Residual) -> str:
-        """Return the place of the largest residuals: a view, and a tag or marker."""
+    def _where(self, residual: Residual) -> Subject:
+        """Return the place of the largest residuals: a view, and a marker."""
         square = np.square(residual.r.reshape(*residual.seen.shape, 2)).sum(axis=-1)
         view, j = np.unravel_index(int(np.argmax(square)), square.shape)
-        number = int(self.calibration.marker[j])
-        return f"in the {self.calibration.view[view]} image, at marker {number}"
+        return Subject(views=(self.calibration.view[view],), markers=(int(self.calibration.marker[j]),))
 
 
 def detected_fault(
@@ -520,8 +521,8 @@ def detected_fault(
     sigma_px: float = 0.0,
     *,
     stated: FloatArray | None = None,
-) -> str:
-    """Return what changed since the calibration, by images of one posture at rest; empty for nothing.
+) -> Finding | None:
+    """Return what changed since the calibration, by images of one posture at rest; None for nothing.
 
     Tags that are off by themselves by less than ``_LEAST_MOVED_PX``, up to half of them, are no change: one
     view of the tool does not tell a tag that moved from one that is bent, or under a slant.
@@ -532,12 +533,12 @@ def detected_fault(
     stated : (V, m) deviations of the pixels of the markers of the calibration, px, if the finder states them.
     """
     if not calibration.usable or not calibration.has_covariance:
-        return ""
+        return None
     pixels = at_known_markers(calibration, marker, images)
     V = len(calibration.P)
     rest, instants, new = np.zeros((V, len(q))), np.zeros(V), np.ones(V, dtype=np.bool_)
 
-    def fault_of(pixels: FloatArray) -> str:
+    def fault_of(pixels: FloatArray) -> Finding | None:
         sigma = max(calibration.sigma_px, sigma_px)
         monitor, q_views = ImageMonitor(calibration, sigma, _SINGLE, image_size=image_size), np.stack([q] * V)
         monitor.observe(instants, q_views, rest, instants, pixels, new, stated=stated)
@@ -548,23 +549,23 @@ def detected_fault(
 
     expected = predict(calibration, q[None])[0]
     if misplaced := _misplaced(pixels, expected, calibration.marker):
-        return f"{misplaced} {PLACE[calibration.mount]}; put them back as they were, or recalibrate"
+        return Finding("misplaced_tags", REFUSES, others=misplaced)
     fault = fault_of(pixels)
-    if not fault:
-        return ""
+    if fault is None:
+        return None
     off, tags = pixels - expected, calibration.marker // CORNERS
     for _ in range(len(np.unique(tags[np.isfinite(off).any(axis=(0, 2))])) // 2):
         tag = _off_alone(off[np.isfinite(off).any(axis=(1, 2))], calibration.marker)
         if not tag.any():
             break
         off, pixels = (np.where(tag[:, None], np.nan, part) for part in (off, pixels))
-        if not fault_of(pixels):
-            return ""
+        if fault_of(pixels) is None:
+            return None
     return fault
 
 
-def _misplaced(pixels: FloatArray, expected: FloatArray, numbers: IntArray) -> str:
-    """Say which tags are turned by quarters, or in each other's places, by pixels (V, m, 2); empty for none.
+def _misplaced(pixels: FloatArray, expected: FloatArray, numbers: IntArray) -> tuple[Finding, ...]:
+    """Return the tags that are turned by quarters, or in each other's places, by pixels (V, m, 2).
 
     If most are, the tool is: its body looks alike from several sides.
     """
@@ -581,15 +582,14 @@ def _misplaced(pixels: FloatArray, expected: FloatArray, numbers: IntArray) -> s
         own, best = rms(tag, tag, 0), min(product(tags, range(CORNERS)), key=lambda to: rms(tag, *to))
         if own > _SIDE * side and best != (tag, 0) and rms(tag, *best) < _LEFT * own:
             moved_to[tag] = best
-    said = []
+    found = []
     for tag, (place, turn) in moved_to.items():
         if place == tag:
-            said.append(f"tag {tag} is {'upside down' if turn == 2 else 'turned by a quarter'}")
+            by = np.pi if turn == 2 else np.pi / 2.0
+            found.append(Finding("turned_tag", subject=Subject(tag=tag), amount=by, unit="rad"))
         elif place not in moved_to or tag < place:
-            said.append(f"tags {tag} and {place} are exchanged")
-    if not moved_to or 2 * len(moved_to) > len(tags):
-        return ""
-    return " and ".join(said)
+            found.append(Finding("exchanged_tags", subject=Subject(markers=(tag, place))))
+    return () if 2 * len(moved_to) > len(tags) else tuple(found)
 
 
 def _off_alone(off: FloatArray, numbers: IntArray) -> BoolArray:

@@ -31,6 +31,7 @@ from projservo_cli.report.report_data import PAGE_FILE, title
 from projservo_cli.simulation.analytic_plant import Plant
 from projservo_cli.simulation.arm import SerialArm
 from projservo_cli.task.face import center_of
+from projservo_cli.words.runs import arrived
 
 _MOST_INSTANTS = 60
 _DOTS = 9  # on the planned path
@@ -383,7 +384,7 @@ def _frames(traces: Mapping[str, Trace], order: IntArray, sizes: FloatArray) -> 
 
     They go from the start to the end of the longest run that converged, if any did.
     """
-    ends = [run.period * run.steps for run in traces.values() if run.verdict == "converged"]
+    ends = [run.period * run.steps for run in traces.values() if arrived(run.verdict)]
     end = max(ends or [run.period * run.steps for run in traces.values()])
     every = [t[:, :, order].reshape(-1, 2) for run in traces.values() for t in (run.s, run.s_star[None])]
     size, views = sizes.max(axis=0), len(sizes)

@@ -21,6 +21,7 @@ from projservo_cli.report.report_data import (
     curve_difference,
     percent,
 )
+from projservo_cli.words.runs import arrived
 from projservo_cli.words.values import joined
 
 
@@ -224,7 +225,7 @@ def _cures(studies: Studies, composition: Composition | None, still: bool) -> It
         f"{trace.verdict}, {joined(trace.self_occluded_steps)} self-occluded steps; drift {fast:.3g} mm "
         f"where a step takes 0.9 of the translation, {three:.3g} mm where it takes {share:g}",
         "converges, no self-occlusion, and the drift is no larger (directTHREE, true operators, no limit)",
-        trace.verdict == "converged"
+        arrived(trace.verdict)
         and not any(trace.self_occluded_steps)
         and fast <= three * (1.0 + _SAMPLING) + _NO_DRIFT_MM,
     )
@@ -236,7 +237,7 @@ def _cures(studies: Studies, composition: Composition | None, still: bool) -> It
             f"{tracked.center_deviation_mm:.3g} mm along the plan, {anew[0]:.3g} (directTHREE) and "
             f"{anew[1]:.3g} mm (directTWO) anew in each step, calibrated operators and the limit",
             "smaller than either, verdict converged",
-            None if still else tracked.verdict == "converged" and tracked.center_deviation_mm < min(anew),
+            None if still else arrived(tracked.verdict) and tracked.center_deviation_mm < min(anew),
         )
 
 
@@ -369,7 +370,7 @@ def _classical(report_data: ReportData) -> Iterator[_Claim]:
             "section 6, Fig. 4",
             f"{trace.verdict} after {trace.steps} steps: {trace.reason}",
             "verdict other than converged",
-            trace.verdict != "converged",
+            not arrived(trace.verdict),
         )
         distance, grown = 1e3 * report_data.center_distance(trace), ""
         if np.isfinite(distance).all():
@@ -393,7 +394,7 @@ def _escape(law: str, trace: Trace, window: int) -> Iterator[_Claim]:
         "section 6, Fig. 4",
         f"{joined(hidden)} self-occluded steps in the {cameras} camera; {trace.verdict}",
         f"steps in {_cameras(len(hidden), 'both', 'all')}, verdict converged",
-        min(hidden) > 0 and trace.verdict == "converged",
+        min(hidden) > 0 and arrived(trace.verdict),
     )
     stretch = plateau_stretch(trace.convergence_error, window)
     measured = "none"
@@ -405,7 +406,7 @@ def _escape(law: str, trace: Trace, window: int) -> Iterator[_Claim]:
         "section 6, Fig. 4",
         f"{measured}; {trace.verdict}",
         f"image error falls < 1 % in {window} steps, verdict converged",
-        stretch is not None and trace.verdict == "converged",
+        stretch is not None and arrived(trace.verdict),
     )
 
 

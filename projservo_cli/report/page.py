@@ -32,6 +32,7 @@ from projservo_cli.report.report_data import (
 )
 from projservo_cli.report.style import FORMATS
 from projservo_cli.store.run_file import Run
+from projservo_cli.words.runs import arrived
 
 
 def _calibration_words(values: Mapping[str, Any], *, estimated: bool) -> Iterator[str]:
@@ -234,7 +235,7 @@ def _law(trace: dict[str, Any], about: About) -> dict[str, Any]:
     return trace | {
         "title": title("/".join(filter(None, (trace.get("step"), run_name(trace["law"], trace["mode"]))))),
         "words": _law_words(trace),
-        "converged": trace["verdict"] == "converged",
+        "converged": arrived(trace["verdict"]),
         "must": must_converge(trace["law"], about.required),
         "hidden": tuple(trace[f"self_occluded_steps_{view}"] for view in trace["view"]),
     }

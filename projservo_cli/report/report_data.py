@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from projservo_cli.calibration.joint_model import describe_curve
-from projservo_cli.findings import Finding, named, of_readings
+from projservo_cli.findings import REFUSES, Finding, Subject, named, of_readings
 from projservo_cli.geometry.kinematics import project
 from projservo_cli.laws import IMAGE_TRACK, POINT_LAWS, REGULATE, TRACK, law_and_mode, title_of
 from projservo_cli.metric.frame import Metric
@@ -362,7 +362,7 @@ def failed_object(
 ) -> dict[str, Any]:
     """Return the JSON object of a stage that failed, or lacks its inputs; why : its reason and findings."""
     failure: dict[str, Any] = {"run": run.path.resolve(), "reason": why[0], "failed": at}
-    failure["findings"] = [one.plain() for one in why[1]]
+    failure["findings"] = list(why[1]) or [Finding("told", REFUSES, Subject(name=why[0]))]
     if stage == "calibrate":
         lists: dict[str, Any] = {name: [] for name in ("advice", "joints", *_LISTS)}
         numbers = dict.fromkeys(_NUMBERS) | dict.fromkeys(_COUNTS, 0)
@@ -484,7 +484,6 @@ def _plan(run: Run) -> dict[str, Any]:
         | angles
         | {
             "objects": objects,
-            "findings": [one.plain() for one in plan.findings],
             "tau_0": plan.tau_0,
             "smallest_margin": plan.margin.min(axis=0),
             "margins": {name: {"min": lowest, "mu": mu} for name, lowest, mu in nearest},

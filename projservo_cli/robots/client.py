@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from projservo_cli.calibration.detections import MIN_SIGMA
+from projservo_cli.findings import LIMITS, REFUSES, Finding, Subject
 from projservo_cli.geometry.algebra import as_array
 from projservo_cli.geometry.kinematics import forward
 from projservo_cli.monitoring.image_monitor import ImageMonitor
@@ -66,7 +67,7 @@ class DrivenRobot:
     watch : over the object that carries the goal; None without one.
     ``q``: (n,) joint readings when last asked for, or the true joints, rad or m. ``H, hidden``: displacement
     of the face and self-occlusion there. ``in_front``: a camera sees nothing behind it. ``disturbance``: why
-    the images no longer agree with the calibration, or what failed; else empty. ``weight``: (V, k) of the
+    the images no longer agree with the calibration, or what failed; else None. ``weight``: (V, k) of the
     pixels shown in a fit, where the robot states their deviations. ``noise_ratio``: of what these state to
     the noise of the run; at least 1. Of each observation since ``begin``: ``delays`` of all views as
     followed, (V,) s, ``readings`` of the joints, (n,), and ``truths`` of a robot that knows them, joints (n,)
@@ -97,7 +98,7 @@ class DrivenRobot:
         self.q = np.zeros(len(plant.limits.lower))
         self.H = np.eye(4)
         self.hidden = np.zeros(V)
-        self.disturbance = ""
+        self.disturbance: Finding | None = None
         self.weight: FloatArray | None = None
         self.retreats = 0  # periods by which it goes back where the object moves
         self.noise_ratio = 1.0
@@ -130,10 +131,7 @@ class DrivenRobot:
         if (limit := self.known.max_force_n) is not None:
             self.forces.append(self.robot.force())
             if self.forces[-1] > limit and not self.disturbance:
-                self.disturbance = (
-                    f"the tool is pressed with {self.forces[-1]:.3g} N, beyond the {limit:g} N of "
-                    "stop.max_force_n: see what it touches"
-                )
+                self.disturbance = Finding("pressed", REFUSES, amount=self.forces[-1], limit=limit, unit="N")
         return self.steered.set_point.at_rest
 
     def observe(self) -> FloatArray:
@@ -141,8 +139,8 @@ class DrivenRobot:
         reading, history, order = self.steered.reading, self.steered.history, self.known.order
         if self.watch is not None:
             self.watch.observe(reading)
-            if self.watch.reason and not self.disturbance:
-                self.disturbance = self.watch.reason
+            if self.watch.moved and not self.disturbance:
+                self.disturbance = self.watch.moved
                 self._retreat()
         if self.monitor is not None:
             _require_apart(self.robot.name, reading)
@@ -210,7 +208,9 @@ class DrivenRobot:
     @property
     def object_moved(self) -> bool:
         """Whether it is the object of the goal that ended the run."""
-        return self.watch is not None and bool(self.disturbance) and self.disturbance == self.watch.reason
+        return (
+            self.watch is not None and self.watch.moved is not None and self.disturbance == self.watch.moved
+        )
 
     def _retreat(self) -> None:
         """Go back the way that it came, by the last joint readings of the run."""
@@ -218,8 +218,8 @@ class DrivenRobot:
             self.steered.command(q - self.steered.target, self.robot.bounds.period)
             self.steered.observe()
 
-    def fits(self) -> str:
-        """Return the fault that images show where the robot stands; empty where enough of them agree.
+    def fits(self) -> Finding | None:
+        """Return the fault that images show where the robot stands; None where enough of them agree.
 
         Nothing is moved meanwhile.
         """
@@ -240,8 +240,8 @@ class DrivenRobot:
             self.give_up()
         return self.disturbance
 
-    def unseen(self, seeing: int, *, held: bool = False) -> str:
-        """Return which cameras show no marker of the calibration, unless so many others do; else empty.
+    def unseen(self, seeing: int, *, held: bool = False) -> Finding | None:
+        """Return the cameras that show no marker of the calibration, unless so many others do; else None.
 
         seeing : number of cameras, at most all of them.
         held : whether the arm may be held meanwhile, to see whether that lasts.
@@ -251,15 +251,11 @@ class DrivenRobot:
         views = self.robot.view
         dark = [view for view, looks in zip(views, self._dark, strict=True) if looks >= WINDOW]
         if len(views) - len(dark) >= min(seeing, len(views)):
-            return ""
-        if len(dark) == 1:
-            return f"the {dark[0]} camera shows no marker of the calibration"
-        none = "neither" if len(views) == 2 else "no"
-        which = f"{none} camera" if len(dark) == len(views) else f"none of the cameras {', '.join(dark)}"
-        return f"{which} shows a marker of the calibration"
+            return None
+        return Finding("unseen_markers", LIMITS, Subject(views=tuple(dark)))
 
-    def at_rest(self, *, held: bool = False) -> str:
-        """Return the fault that images show by the test of one posture, that of ``doctor``; else empty.
+    def at_rest(self, *, held: bool = False) -> Finding | None:
+        """Return the fault that images show by the test of one posture, that of ``doctor``; else None.
 
         held : whether the arm may be held meanwhile, to see whether that lasts.
         """
@@ -283,7 +279,7 @@ class DrivenRobot:
         agreeing = observations if self.monitor is None else self.monitor.agreeing
         return agreeing >= WINDOW and not self.pending
 
-    def agrees(self) -> str:
+    def agrees(self) -> Finding | None:
         """Test the last images, holding the arm while they disagree; return the fault."""
         self.observe()
         if self._held_while(lambda: self.holds, _MOST_LOOKS):

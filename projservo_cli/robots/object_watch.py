@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from projservo_cli.findings import REFUSES, Finding, Subject
 from projservo_cli.monitoring.innovation_tests import WINDOW
 from projservo_cli.records import FloatArray, IntArray
 from projservo_cli.robots.contract import Reading
@@ -20,18 +21,19 @@ _LEAST_MARKERS = 2  # seen in a view in all these frames
 
 
 class ObjectWatch:
-    """Object that stands still while a robot moves, or the reason why it does not.
+    """Object that stands still while a robot moves, or the finding that it does not.
 
     A marker that is hidden is where it was seen last.
 
     name : of the object; marker : (k,) numbers of its markers, at these places (k,) among those of objects.
     s : (V, k, 2) px of them when the motion was planned, NaN where unseen.
-    ``reason``: what has moved, and by how much; empty where nothing has.
+    ``moved``: that it has, and by how much; None where it has not.
     """
 
     def __init__(self, name: str, marker: Sequence[int], places: IntArray, s: FloatArray) -> None:
         self.name, self._marker, self._places = name, marker, places
-        self._planned, self.reason, self._looks = s, "", 0
+        self._planned, self._looks = s, 0
+        self.moved: Finding | None = None
         self._frames: list[deque[FloatArray]] = [deque(maxlen=_FRAMES) for _ in s]
 
     @property
@@ -42,7 +44,7 @@ class ObjectWatch:
     def observe(self, reading: Reading) -> None:
         """Compare a reading with where the object was."""
         off = list[bool]()
-        told = ""
+        found: Finding | None = None
         for view, frames in enumerate(self._frames):
             seen_now = reading.s_objects[view, self._places]
             if not frames or not np.array_equal(seen_now, frames[-1], equal_nan=True):  # else the same frame
@@ -56,10 +58,8 @@ class ObjectWatch:
             most = max(_LEAST_PX, _DEVIATIONS * sigma * math.sqrt(1.0 + 1.0 / _FRAMES))
             off.append(bool((px := float(np.median(away[seen]))) > most))
             if off[-1]:
-                told = f"{px:.3g} px in the {reading.view[view]} image ({most:.2g} at most)"
+                of = Subject(views=(reading.view[view],), markers=tuple(self._marker), name=self.name)
+                found = Finding("moved_object", REFUSES, of, px, limit=most, unit="px")
         self._looks = self._looks + 1 if any(off) else 0
         if off and (all(off) or self._looks >= LOOKS):
-            self.reason = self.reason or (
-                f"the object {self.name}, markers {self._marker[0]} to {self._marker[-1]}, has moved since "
-                f"the motion was planned, by {told}: let it lie still, and plan again"
-            )
+            self.moved = self.moved or found

@@ -9,6 +9,8 @@ from projservo_cli.records import FloatArray, InputError, WorkFailed
 from projservo_cli.robots.contract import PluginRobot, at_rest_after
 from projservo_cli.robots.object_watch import LOOKS, ObjectWatch
 from projservo_cli.robots.pacing import Steered
+from projservo_cli.words import line
+from projservo_cli.words.table import Setup
 
 
 class Session:
@@ -77,8 +79,9 @@ class Session:
         assert self.steered is not None
         for _ in range(LOOKS):
             watch.observe(self.steered.hold())
-            if watch.reason:
-                raise WorkFailed(f"nothing was taken: {watch.reason}")
+            if watch.moved:
+                why = line(watch.moved, Setup())
+                raise WorkFailed(f"nothing was taken: {why}", findings=[watch.moved])
         if not watch.seen:
             raise WorkFailed(
                 f"nothing was taken: no image shows the object {watch.name} where it is to be: look where it "

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from projservo_cli.findings import Finding
 from projservo_cli.geometry.algebra import Mat4, Vec4, apply, as_array, axpy, dot, mat, vec, vec_into
 from projservo_cli.geometry.jit import merged, njit
 from projservo_cli.geometry.kinematics import forward, from_border, row
@@ -125,7 +126,7 @@ class AnalyticPlant:
     ``q, H``: (n,) true joints, rad or m, and (4, 4) displacement of the face. ``in_front``: whether every
     marker was in front of enough cameras when last observed. ``markers``: how many are observed, those of
     the face first. ``hidden``: (V,) 1 where the face was self-occluded when last observed.
-    ``disturbance``: why the law that drove it failed; else empty. ``takes_parts``: it goes straight to the
+    ``disturbance``: why the law that drove it failed; else None. ``takes_parts``: it goes straight to the
     end of each step; the samples are the same. ``weight``: all pixels weigh alike. ``holds, pending``:
     nothing tests its images.
     """
@@ -145,7 +146,7 @@ class AnalyticPlant:
         self.hidden = np.zeros(len(plant.O))
         self.in_front = True
         self.markers = len(plant.M) + len(plant.pins)
-        self.disturbance = ""
+        self.disturbance: Finding | None = None
 
     def joints(self) -> FloatArray:
         """Joint readings (n,), rad or m."""

@@ -42,7 +42,7 @@ from projservo_cli.stages.stage_inputs import (
 )
 from projservo_cli.store.observation_tables import mount_in, read_detections, read_table, to_csv
 from projservo_cli.words import lines, with_findings
-from projservo_cli.words.values import Setup
+from projservo_cli.words.table import Setup
 
 _Calibrated = tuple[Observation, Calibration, CrossValidation | None]
 

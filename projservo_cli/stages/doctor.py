@@ -25,6 +25,7 @@ from projservo_cli.robots.pacing import Steered
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.external_robot import plugin_robot
 from projservo_cli.stages.stage_inputs import OwnRobot, PreflightInputs
+from projservo_cli.words import line, setup_of
 
 # Time of observation of a robot at rest, s, and minimum number of readings.
 _LOOK_S, _MIN_LOOKS = 1.5, 8
@@ -167,7 +168,12 @@ def calibration_finding(
     if not np.isfinite(at_rest.s[:, np.isin(marker, calibration.marker)]).any():
         return Finding(WARNING, _CALIBRATION, "was not compared: no marker of it is seen", "show the tags")
     if fault := detected_fault(calibration, at_rest.q, marker, at_rest.s, size):
-        return Finding(FAULT, _CALIBRATION, fault, "put that back, or record and calibrate again")
+        return Finding(
+            FAULT,
+            _CALIBRATION,
+            line(fault, setup_of(calibration)),
+            "put that back, or record and calibrate again",
+        )
     images = at_known_markers(calibration, marker, at_rest.s)
     mm = resting_error_mm(calibration, at_rest.q, at_rest.face, lengths, images)
     within = "" if mm is None else f", which show the tool within {mm:.2g} mm of where its joints put it"

@@ -63,7 +63,7 @@ from projservo_cli.task.visibility import (
     visibility_translation,
 )
 from projservo_cli.words import line, lines, setup_of, text
-from projservo_cli.words.values import Setup
+from projservo_cli.words.table import Setup
 
 
 def _partitioned(
@@ -236,7 +236,7 @@ def _require_taught_since(scenario: Scenario, calibration: Calibration) -> None:
     if images.joints is not None:
         q = images.joints.values(calibration.joint_types)
         if fault := detected_fault(calibration, q, numbers, seen, size):
-            raise WorkFailed(_CHANGED.format(fault=fault, advice="teach it again"))
+            raise _changed(fault, calibration, "teach it again")
         _require_rigid(rigid_fit(calibration, q, *whole), calibration.view, "teach it again")
         return
     stated = images.sigma_px(scenario.numbers[: scenario.m], scenario.inputs.face)
@@ -264,7 +264,7 @@ def _require_taught_since(scenario: Scenario, calibration: Calibration) -> None:
             f"px off in the {calibration.view[v]} one, {near_px:.3g} px are allowed; {check}"
         )
     if enough and (fault := detected_fault(calibration, q, numbers, seen, size, sigma)):
-        raise WorkFailed(_CHANGED.format(fault=fault, advice=advice))
+        raise _changed(fault, calibration, advice)
     if not enough and not fit.reached:
         units = scenario.joints.units
         there = ", ".join(in_unit(x, unit, 4) for x, unit in zip(q.tolist(), units, strict=True))
@@ -275,7 +275,11 @@ def _require_taught_since(scenario: Scenario, calibration: Calibration) -> None:
         )
 
 
-_CHANGED = "the goal was taught after a change since the calibration: {fault}; {advice}"
+def _changed(fault: Finding, calibration: Calibration, advice: str) -> WorkFailed:
+    """Return the failure of a goal that was taught after a fault."""
+    why = line(fault, setup_of(calibration))
+    words = f"the goal was taught after a change since the calibration: {why}; {advice}"
+    return WorkFailed(words, findings=[fault])
 
 
 def _require_rigid(fit: RigidFit, view: Sequence[str], advice: str) -> None:

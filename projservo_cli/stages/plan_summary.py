@@ -55,7 +55,7 @@ def _at_instant(motion: Motion, constraint: int, instant: int) -> Finding:
         if constraint == VISIBILITY:
             return Finding("motion_visibility", subject=subject, amount=worst)
         if worst <= BEHIND:
-            return Finding("behind_camera", subject=subject)
+            return Finding("motion_behind", subject=subject)
         if worst < 0.0:
             return Finding("outside_image", subject=subject, amount=-worst, unit="px")
         return Finding("motion_border", subject=subject, amount=worst, limit=demands.border_px, unit="px")

@@ -2,7 +2,7 @@
 
 import copy
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, partial
@@ -13,6 +13,7 @@ from threadpoolctl import threadpool_limits
 
 from projservo_cli import plugins
 from projservo_cli.control.law import ERRORS, LOST, MAX_PARTS, OK, TAU_AFFINE, THETA_S, Gains
+from projservo_cli.findings import LIMITS, NOTE, REFUSES, Finding, Subject
 from projservo_cli.geometry.algebra import as_array, mat
 from projservo_cli.geometry.kernels import COORDINATES
 from projservo_cli.geometry.kinematics import forward
@@ -24,12 +25,24 @@ from projservo_cli.loop.python import BuiltInLaw, LoopLaw, run_in_python
 from projservo_cli.loop.replanning import ExecutionMonitor
 from projservo_cli.loop.run_metrics import Ended, Summary, angle_between, path_deviation, summarize
 from projservo_cli.loop.stall_monitor import StallMonitor
-from projservo_cli.loop.verdicts import PLATEAU_FALL, VERDICTS, Log, new_log, plateau_stretch, tolerance
+from projservo_cli.loop.verdicts import (
+    CONVERGED,
+    FAULT_DETECTED,
+    OBJECT_MOVED,
+    PLATEAU_FALL,
+    VERDICT_NAMES,
+    Log,
+    new_log,
+    plateau_stretch,
+    tolerance,
+)
 from projservo_cli.monitoring.accuracy import Posture, metres_a_unit, rigid_fit
 from projservo_cli.monitoring.innovation_tests import WINDOW
 from projservo_cli.plugins import what_failed
 from projservo_cli.records import (
     MM,
+    TOOL,
+    WORLD,
     BoolArray,
     Calibration,
     FloatArray,
@@ -39,7 +52,6 @@ from projservo_cli.records import (
     Plan,
     Trace,
     WorkFailed,
-    in_unit,
 )
 from projservo_cli.results import ImageModel
 from projservo_cli.robots.client import DrivenRobot
@@ -64,7 +76,9 @@ from projservo_cli.task.incidences import (
     whole_pose,
 )
 from projservo_cli.task.target import TaskImages, followed
-from projservo_cli.words import order_advice
+from projservo_cli.words import line, order_advice, text
+from projservo_cli.words.runs import VERDICTS, arrived
+from projservo_cli.words.table import Setup
 
 _RETREAT = 10  # periods by which an arm goes back where the object of its goal moves
 _NOT_DRIVEN: Any = None  # in place of what a run leaves
@@ -98,14 +112,14 @@ class LawRun:
     session: Session | None = None  # whose robot is driven; None for a connection of its own
     # As it ended.
     verdict: str = ""
-    why: str = ""  # what held, disturbed or failed it, where something did
+    why: Finding | None = None  # what held, disturbed or failed it, where something did
     steps: int = 0  # commands sent
     log: Log = _NOT_DRIVEN  # the recorded run, once it was driven
     limited: float = 0.0  # how often visibility limited the translation
     plant: Plant = _NOT_DRIVEN  # that was driven; of an external robot the calibrated model
-    replannings: tuple[str, ...] = ()  # time and reason of each replanning
+    replannings: tuple[Finding, ...] = ()
     driven: DrivenRobot | None = None  # client of a robot of the contract
-    unseen: str = ""  # which cameras showed nothing before the run, though they were to be compared
+    unseen: Finding | None = None  # cameras that showed nothing before the run, though they were compared
     noise_ratio: float = 1.0  # of what pixels stated at the end to the noise of the run; at least 1
     own_tolerance: float | None = None  # of an error that a law of somebody's states
 
@@ -116,13 +130,19 @@ class LawRun:
         return 1.0 if own is None else own / self.scenario.termination.image_error_px
 
     @property
+    def setup(self) -> Setup:
+        """Return the arm and the cameras for words."""
+        mount = TOOL if self.scenario.model.on_tool else WORLD
+        return Setup(mount, self.scenario.view, len(self.scenario.joints.units))
+
+    @property
     def judged(self) -> tuple[str, str]:
         """Name and unit of the error that decides convergence, as words have them."""
         if self.own_tolerance is not None:
             return "error of the law", ""
         if self.scenario.exact.incidences and not math.isnan(float(self.log.fit[self.steps, 2])):
-            return "error of the incidences", " px"
-        return "image error", " px"
+            return "error of the incidences", "px"
+        return "image error", "px"
 
     @property
     def replans(self) -> bool:
@@ -154,7 +174,7 @@ class LawRun:
         self.log = new_log(len(q_start), observed, limits.max_steps, len(ERRORS), parts, V)
         course = Course(self.plant, limits, q_start.copy())
         code, self.steps = run_compiled(controller.law, course, noise, controller.state, self.log)
-        self.verdict, self.limited = VERDICTS[code], float(controller.state.limited[0])
+        self.verdict, self.limited = VERDICT_NAMES[code], float(controller.state.limited[0])
 
     def by_contract(self) -> None:
         """Drive a robot of the contract from the start of the task, where a simulated one stands.
@@ -183,7 +203,7 @@ class LawRun:
                 wrong = driven.fits()
                 refutes = not driven.object_moved
                 if wrong:
-                    raise WorkFailed(f"the robot did not move, since at the start {wrong}", refutes=refutes)
+                    raise self._stopped("the robot did not move, since at the start", wrong, refutes=refutes)
                 assert contract.settle_s is not None
                 start, settle_s = scenario.ends.q_start, contract.settle_s
                 unseen = self._require_images(driven, "the robot did not move, since where it stands", 1)
@@ -192,23 +212,27 @@ class LawRun:
                 for _ in () if stands else path:
                     if wrong := driven.agrees():
                         refutes = not driven.object_moved
-                        raise WorkFailed(f"stopped on the path to the start, since {wrong}", refutes=refutes)
+                        raise self._stopped("stopped on the path to the start, since", wrong, refutes=refutes)
                 if wrong := driven.at_rest(held=True):
-                    raise WorkFailed(f"stopped at the start, since {wrong}", refutes=True)
+                    raise self._stopped("stopped at the start, since", wrong, refutes=True)
                 at_start = self._require_images(driven, "stopped at the start of the task, since", 2)
                 self.unseen = at_start or unseen
             driven.begin()
             driven.retreats = _RETREAT
             self.in_python(controller, driven, StallMonitor(driven, scenario.termination))
 
-    def _require_images(self, driven: DrivenRobot, what: str, seeing: int) -> str:
+    def _stopped(self, what: str, fault: Finding, *, refutes: bool) -> WorkFailed:
+        """Return the failure of a robot that a fault stopped before the run."""
+        return WorkFailed(f"{what} {line(fault, self.setup)}", refutes=refutes, findings=[fault])
+
+    def _require_images(self, driven: DrivenRobot, what: str, seeing: int) -> Finding | None:
         """Refuse to move a robot of which fewer than so many cameras show markers, unless that was asked for.
 
         Of fewer cameras, all must.
         """
         unseen = driven.unseen(seeing, held=seeing > 1)
         if unseen and not self.blind:
-            remarks = "; ".join([unseen, *driven.robot.remarks()])
+            remarks = "; ".join([line(unseen, self.setup), *driven.robot.remarks()])
             raise WorkFailed(
                 f"{what} {remarks}: uncover {all_of(driven.robot.view)} and look at the light, or move the "
                 "arm by hand to where they see the tags; --blind (blind=True) drives it without images"
@@ -241,16 +265,16 @@ class LawRun:
             self.own_tolerance = law.tolerance
         if isinstance(plant, DrivenRobot):
             self.driven = plant
-            if VERDICTS[code] == "converged" and plant.at_rest():
-                code = VERDICTS.index("fault detected")
-            if VERDICTS[code] == "fault detected" and plant.object_moved:
-                code = VERDICTS.index("object moved")
+            if code == CONVERGED and plant.at_rest():
+                code = FAULT_DETECTED
+            if code == FAULT_DETECTED and plant.object_moved:
+                code = OBJECT_MOVED
             # It moves from sample to sample, in any mode.
             path = np.stack([self.log.q, np.roll(self.log.q, -1, axis=0)], axis=1)
             self.log = self.log._replace(path=path, parts=np.ones_like(self.log.parts))
-        self.verdict, self.plant = VERDICTS[code], plant.plant
+        self.verdict, self.plant = VERDICT_NAMES[code], plant.plant
         self.limited = float(law.state.limited[0]) if isinstance(law, BuiltInLaw) else 0.0
-        self.why = plant.disturbance or ("" if stall is None else stall.reason)
+        self.why = plant.disturbance or (None if stall is None else stall.reason)
         self.replannings = () if execution is None else tuple(execution.attempts)
 
     def _task(self, model: Model, plan: Plan) -> Task:
@@ -310,7 +334,7 @@ class LawRun:
     @cached_property
     def summary(self) -> Summary:
         """Numbers of the run; NaN if they need an unknown truth."""
-        ended = Ended(VERDICTS.index(self.verdict), self.steps, self.limited)
+        ended = Ended(VERDICT_NAMES.index(self.verdict), self.steps, self.limited)
         found = summarize(self.plant, self.log, ended, self.scenario.gains.period, self.true_ends)
         return found if self.scenario.truth is not None else found._replace(success=math.nan)
 
@@ -384,11 +408,10 @@ class LawRun:
         simulated = scenario.truth is not None
         center = np.asarray(H @ np.array(center_of(self.plant.M, self.plant.center)))[:, :3]
         driven = self.driven
-        lost = (
-            _blind_view(log.s[:rows], scenario.view, WINDOW) if driven and self.verdict == "converged" else ""
-        )
+        dark = _blind_view(log.s[:rows], scenario.view, WINDOW) if driven and arrived(self.verdict) else ()
+        lost = text([self.unseen] if self.unseen else dark, self.setup)
         untested = "" if driven is None else scenario.untested
-        replanned = f"; replanned {', '.join(self.replannings)}" if self.replannings else ""
+        found = (*_reason(self, joint, remaining), *self.replannings)
         if driven is not None:  # the log has the predicted rest of the robot instead of readings
             read = _whole(driven.readings, rows)
         values = self.summary._asdict() | {"center_deviation_mm": self.deviation_mm()}
@@ -409,7 +432,8 @@ class LawRun:
             mode=self.mode,
             planned_s=self.planned_s,
             verdict=self.verdict,
-            reason=_reason(self, joint, remaining) + replanned,
+            reason=text(found, self.setup),
+            findings=found,
             replan_attempts=len(self.replannings),
             steps=steps,
             period=scenario.gains.period,
@@ -441,7 +465,7 @@ class LawRun:
             unplanned=self.unplanned,
             **self._incidences(),
             **_stated_mm(self, views),
-            untested="; ".join(filter(None, (untested, self.unseen or lost))),
+            untested="; ".join(filter(None, (untested, lost))),
             overruns=None if driven is None else driven.steered.overruns,
             force=None if driven is None or not driven.forces else _whole(driven.forces, rows),
             latency=None if driven is None else _whole(driven.delays, rows),
@@ -499,7 +523,8 @@ def _stated_mm(run: LawRun, views: FloatArray) -> dict[str, Any]:
     noise = [_LEAST_NOISE_PX, scenario.noise_px, 0.0 if calibration is None else calibration.sigma_px]
     left = _rms(run.log.fit[run.steps, 1:2], 2.0 * views[-1:] - COORDINATES)[0]
     untested = run.driven is not None and scenario.untested
-    if run.verdict in ("fault detected", "failed") or untested or left > _AGREES * max(noise):
+    ended = VERDICTS[run.verdict]
+    if ended.refutes or ended.retried or untested or left > _AGREES * max(noise):
         return {}
     numbers, q, known = scenario.numbers_of(run.law), run.log.read[run.steps], calibration or scenario.truth
     assert known is not None
@@ -540,106 +565,101 @@ def _rms(squares: FloatArray, count: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(mean))
 
 
-def _stalled_by(run: LawRun) -> str:
+def _stalled_by(run: LawRun) -> Finding:
     """Return why the image error stopped falling: commands too slow to lower it, or a local minimum.
 
     Joints that move on at their limits, as a law asks of them near a singularity, are not slow.
     """
     gains, window = run.scenario.gains, run.scenario.termination.stall_periods
+    minimum = Finding("local_minimum", LIMITS)
     if run.steps < window:
-        return "a local minimum"
+        return minimum
     limited = float(np.median(run.log.factor[run.steps - window : run.steps]))
     share = min(1.0, max(gains.gain, gains.gain_s) * gains.period * gains.scale * limited)
     moved = np.abs(np.diff(run.log.read[run.steps - window : run.steps + 1], axis=0)).sum(axis=0).max()
     if 1.0 - (1.0 - share) ** window > 2.0 * PLATEAU_FALL or moved > _HARDLY:
-        return "a local minimum"
-    return (
-        f"commands are too slow, {share:.2g} of the way in a period; raise plant.speed_scale, the limits of "
-        "joint speeds, control.period_s, or stop.stall_periods"
+        return minimum
+    return Finding("slow_commands", LIMITS, amount=share)
+
+
+def _reason(run: LawRun, joint: int, remaining: tuple[float | None, float | None]) -> Iterator[Finding]:
+    """Yield the reasons of the verdict."""
+    log, steps, limits, verdict = run.log, run.steps, run.scenario.termination, run.verdict
+    name, unit = run.judged
+    error, within = (
+        run.own_unit * value
+        for value in (float(log.judged[steps]), tolerance(limits, float(log.fit[steps, 2]), run.noise_ratio))
     )
-
-
-def _reason(run: LawRun, joint: int, remaining: tuple[float | None, float | None]) -> str:
-    """Return the reason of the verdict, one sentence."""
-    log, steps, limits, (judged, unit) = run.log, run.steps, run.scenario.termination, run.judged
-    error, first = (f"{run.own_unit * float(log.judged[k]):.3g}{unit}" for k in (steps, 0))
-    within = f"{run.own_unit * tolerance(limits, float(log.fit[steps, 2]), run.noise_ratio):.3g}{unit}"
-    share, turn = remaining
-    left = [
-        *([] if share is None else [f"{share:.1%} of the translation"]),
-        *([] if turn is None else [f"{turn:.3g} deg of rotation"]),
-        f"an {judged} of {error}",
-    ]
-    rest = f"{' and '.join(left)} {'are' if len(left) > 1 else 'is'} left"
-    at_limit = in_unit(float(log.read[steps, joint]), run.scenario.joints.units[joint])
-    unseen = "a marker was not seen"
-    if limits.max_lost_periods:
-        unseen += f", {limits.max_lost_periods} periods after the last that was"
-    reasons = {
-        "converged": f"{judged} {error} is within {within}{_vague(run)}{_apart(run)}",
-        "no progress": f"the robot stands still at an {judged} of {error}: {run.why}"
-        if run.why
-        else f"no step left; {judged} {error} fell by less than 1 % in the last "
-        f"{limits.stall_periods} steps: {_stalled_by(run)}",
-        "following error": f"{run.why}; {rest}",
-        "max steps": f"no step left; {judged} {error} was still changing",
-        "diverged": _grown(run, judged, error, first),
-        "out of view": f"a face marker left an image at step {steps}",
-        "behind camera": f"a face marker passed behind a camera at step {steps}",
-        "markers lost": f"the law could not measure the face at step {steps}: {run.why or unseen}",
-        "joint limit": f"joint {joint + 1} stands at its limit, {at_limit}, and the task would take it "
-        f"beyond; {rest}",
-        "singular": f"the joint motion was not unique at step {steps}: the robot is near a singularity",
-        **dict.fromkeys(("fault detected", "failed", "object moved"), run.why),
-    }
-    obstruction = ""
-    if run.driven is not None and run.verdict != "converged":
-        obstruction = obstruction_of(run.driven.robot.robot)
-    blind = (
-        ""
-        if run.verdict == "converged"
-        else _blind_view(log.s[: steps + 1], run.scenario.view, limits.stall_periods)
+    own = Finding(
+        verdict.replace(" ", "_"), REFUSES, Subject(name=name, joints=(joint + 1,)), error, unit=unit
     )
-    return "; ".join(filter(None, (reasons[run.verdict], blind, obstruction)))
+    at_step = replace(own, amount=float(steps), unit="1")
+    if verdict == "converged":
+        yield replace(own, severity=NOTE, limit=within)
+        yield from (*_vague(run), *_apart(run))
+        return
+    if verdict == "no progress":
+        yield replace(own, others=(run.why or _stalled_by(run),))
+    elif verdict == "markers lost":
+        unseen = Finding("marker_unseen", amount=limits.max_lost_periods, unit="1")
+        yield replace(at_step, others=(run.why or unseen,))
+    elif verdict == "diverged":
+        yield _grown(run, own, at_step)
+    elif verdict == "joint limit":
+        unit = "m" if run.scenario.model.prismatic[joint] else "rad"
+        yield replace(own, amount=float(log.read[steps, joint]), unit=unit)
+    elif run.why is not None:
+        yield run.why
+    else:
+        yield own if verdict == "max steps" else at_step
+    if verdict in ("following error", "joint limit"):
+        share, turn = remaining
+        parts = [] if share is None else [Finding("share", amount=share, unit="1")]
+        parts += [] if turn is None else [Finding("turn", amount=math.radians(turn), unit="rad")]
+        yield replace(own, code="remaining", others=tuple(parts))
+    yield from _blind_view(log.s[: steps + 1], run.scenario.view, limits.stall_periods)
+    if run.driven is not None and (obstruction := obstruction_of(run.driven.robot.robot)):
+        yield Finding("told", LIMITS, Subject(name=obstruction))
 
 
-def _grown(run: LawRun, judged: str, error: str, first: str) -> str:
-    """Say which of error, distance and command made a run diverge."""
+def _grown(run: LawRun, own: Finding, at_step: Finding) -> Finding:
+    """Return which of error, distance and command made a run diverge."""
     log, more = run.log, run.scenario.termination.diverged_factor
+    times, first = (Finding("factor", amount=more),), run.own_unit * float(log.judged[0])
     at, begun = rig_distance(run.plant, run.plant.M @ log.H[run.steps].T), float(log.begun[0])
     if log.judged[run.steps] > more * log.begun[1]:
-        return f"{judged} {error} is more than {more:g} times that at first, {first}"
+        return replace(own, code="error_grew", limit=first, others=times)
     if at > more * begun > 0.0:
-        return f"the face is {at:.3g} m from the cameras, over {more:g} times the {begun:.3g} m at first"
-    return f"the command at step {run.steps} is not finite, at an {judged} of {error}"
+        return replace(own, code="face_left", amount=at, limit=begun, unit="m", others=times)
+    return replace(at_step, code="not_finite")
 
 
-def _vague(run: LawRun) -> str:
-    """Say that markers are seen there with more noise than elsewhere; empty if they are not."""
-    more, look = run.noise_ratio, "look what covers them"
-    return f"; markers there state {more:.2g} times the noise: {look}" if more > _VAGUE else ""
+def _vague(run: LawRun) -> Iterator[Finding]:
+    """Tell that markers are seen there with more noise than elsewhere."""
+    if run.noise_ratio > _VAGUE:
+        yield Finding("vague_markers", LIMITS, amount=run.noise_ratio, limit=_VAGUE)
 
 
-def _apart(run: LawRun) -> str:
-    """Say that the face as it is seen is off by more than noise, though the whole body is not; else empty."""
+def _apart(run: LawRun) -> Iterator[Finding]:
+    """Tell that the face as it is seen is off by more than noise, though the whole body is not."""
     displaced = run.scenario.inputs.displaced  # to where it was never seen
     if run.scenario.exact.incidences or displaced:  # the face may be anywhere that they leave open
-        return ""
+        return
     limits = run.scenario.termination
     by_noise = limits.image_error_px + (run.noise_ratio - 1.0) * limits.noise_px
     seen, most = float(run.log.error[run.steps]), _BY_NOISE * by_noise
-    text = f"; the face itself is seen {seen:.3g} px off ({most:.3g} px by noise): it moved on the tool"
-    return f"{text} since the goal was taught: teach it again" if seen > most else ""
+    if seen > most:
+        yield Finding("face_apart", LIMITS, amount=seen, limit=most, unit="px")
 
 
-def _blind_view(s: FloatArray, names: Sequence[str], window: int) -> str:
-    """Say which camera showed no marker in the last images (k, V, m, 2), and since when; else empty."""
+def _blind_view(s: FloatArray, names: Sequence[str], window: int) -> Sequence[Finding]:
+    """Return the camera that showed no marker in the last images (k, V, m, 2), and since when."""
     for view, name in enumerate(names):
         steps = np.flatnonzero(np.isfinite(s[:, view, :, 0]).any(axis=1))
         last = int(steps[-1]) if steps.size else -1
         if len(s) - last > window:
-            return f"the {name} camera has shown no marker of the face since step {last + 1}: check it"
-    return ""
+            return (Finding("blind_camera", LIMITS, Subject(views=(name,)), last + 1.0, unit="1"),)
+    return ()
 
 
 def run(inputs: ServoInputs, calibration: Calibration, plan: Plan, name: str, **brought: Any) -> Trace:

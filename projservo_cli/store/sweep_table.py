@@ -54,11 +54,11 @@ class Failure(NamedTuple):
     first: int  # number of the first of them
     reason: str  # why that one did, in words
 
-    def words(self, law: str) -> str:
-        """Return it in words, without the name of the law in the reason."""
+    @property
+    def words(self) -> str:
+        """Return it in words."""
         runs = "1 run" if self.runs == 1 else f"{self.runs} runs"
-        why = self.reason.removeprefix(f"law {law}: ")
-        return f"{runs} failed or did not start, first run {self.first}: {why}"
+        return f"{runs} failed or did not start, first run {self.first}: {self.reason}"
 
 
 def merge_failures(found: dict[str, Failure], more: Iterable[tuple[str, Failure]]) -> None:

@@ -14,7 +14,7 @@ from projservo_cli.geometry.kernels import COORDINATES
 from projservo_cli.laws import CODES
 from projservo_cli.loop.batch import NUMBERS, VERDICT, Batch, Setting
 from projservo_cli.loop.compiled import Course
-from projservo_cli.loop.verdicts import FAILED, RUNNING, VERDICTS
+from projservo_cli.loop.verdicts import RUNNING, VERDICT_NAMES
 from projservo_cli.records import (
     VIEWS,
     Calibration,
@@ -33,9 +33,10 @@ from projservo_cli.stages.servo import drive, sense_is_enough
 from projservo_cli.stages.stage_inputs import PlanInputs, ServoInputs
 from projservo_cli.store.sweep_table import Failure, Heading, merge_failures
 from projservo_cli.sweeps.design import RUNS, Design, name_of_run
+from projservo_cli.words import line
+from projservo_cli.words.runs import VERDICTS
 
 _NOT_CALIBRATED, _NOT_STARTED = "not calibrated", "not started"
-ALL_VERDICTS = (*VERDICTS, _NOT_CALIBRATED, _NOT_STARTED)
 # Reason of a compiled run that did not start.
 _UNMEASURED = "its images of start and goal do not show the task"
 _LONGEST = 300  # characters of a reason that is kept
@@ -67,7 +68,7 @@ def measured_columns(view: Sequence[str] = VIEWS) -> tuple[Heading, ...]:
     about = (f"times at which the {name} camera is behind the face" for name in view)
     hidden = (Heading(name, "i8", "1", text) for name, text in zip(_self_occluded(view), about, strict=True))
     return (
-        _text("verdict", ALL_VERDICTS, "verdict of the run"),
+        _text("verdict", VERDICT_NAMES, "verdict of the run"),
         Heading(
             "success",
             "u1",
@@ -136,7 +137,7 @@ def _displayed(value: Any) -> Any:
 
 _Columns = dict[str, npt.NDArray[Any]]
 # Text of a verdict of the kernel in the table.
-_SAID = {code: name.encode() for code, name in enumerate(VERDICTS)}
+_SAID = {code: name.encode() for code, name in enumerate(VERDICT_NAMES)}
 
 
 class Part(NamedTuple):
@@ -330,4 +331,8 @@ def _run(
     row |= zip(_self_occluded(scenario.view), made.self_occluded_steps, strict=True)
     if design.sweep.between_samples:
         row[BETWEEN.name] = made.deviation_mm()
-    return row, made.trace() if keep else None, made.why if made.verdict == VERDICTS[FAILED] else ""
+    return (
+        row,
+        made.trace() if keep else None,
+        "" if made.why is None or not VERDICTS[made.verdict].retried else line(made.why, made.setup),
+    )

@@ -243,7 +243,7 @@ class Study(Displayable):
         cells = self.success()
         values = {"runs": f"{len(self.table['run'])} in {len(cells)} cells"}
         failures = [*self._table.failures.items()][:_SHOWN_FAILURES]
-        values |= {f"failures of {self._names.get(law, law)}": one.words(law) for law, one in failures}
+        values |= {f"failures of {self._names.get(law, law)}": one.words for law, one in failures}
         shown = _SHOWN - len(failures)
         for cell in cells[:shown]:
             low, high = cell["success_interval"]

@@ -9,15 +9,13 @@ from itertools import groupby
 from typing import Any
 
 from projservo_cli.findings import DEVIATIONS, LIMITS, NOTE, REFUSES, Finding, columns, first, usable
-from projservo_cli.records import TOOL, Calibration
-from projservo_cli.words import calibrations
-from projservo_cli.words.plans import PLANS
-from projservo_cli.words.rows import Row
-from projservo_cli.words.values import Setup, Told, quantity
+from projservo_cli.records import TOOL as TOOL
+from projservo_cli.records import Calibration
+from projservo_cli.words.table import ROWS, Setup
+from projservo_cli.words.values import Told, quantity
 
 # Maximum number of deviations from the model in advice.
 _MAX_NAMED = 3
-ROWS: dict[str, Row] = calibrations.OF_MODEL | calibrations.CALIBRATION | calibrations.REFUSALS | PLANS
 _CAUSES = ("other_mount", "images_before_readings", "images_after_readings", "joint_type", "standing_joint")
 # Findings of which one line names all that are alike.
 _TOGETHER = ("placeholders", "hopeless_joint", "joint_together", "joint_in_few_poses", "little_motion")
@@ -27,7 +25,7 @@ _OF_REASON = ("noise", "residuals", "closed_form", "joint_noise", "deviations", 
 
 def limit(one: Finding, setup: Setup) -> str:
     """Return what a finding limits predictions by, after "limited by"."""
-    return _row(one, setup).limit.format_map(_told([one], setup))
+    return Told([one], setup).text("limit")
 
 
 def sentence(one: Finding, setup: Setup) -> str:
@@ -56,7 +54,7 @@ def reason(findings: Sequence[Finding], setup: Setup) -> str:
     about, *rest = findings
     text = sentence(about, setup)
     if about.code == "closed_form":
-        return f"{text}: {_row(about, setup).remedy}"
+        return f"{text}: {Told([about], setup).text('remedy')}"
     if about.code == "told" and first(rest, REFUSES) is None:
         return text
     text += "".join(f", with {sentence(one, setup)}" for one in rest if one.code == "joint_noise")
@@ -129,23 +127,15 @@ def _cause(findings: Sequence[Finding]) -> Finding:
     return first(limiting, REFUSES) or first(limiting, LIMITS) or about
 
 
-def _row(one: Finding, setup: Setup) -> Row:
-    return (calibrations.ON_THE_TOOL if setup.mount == TOOL else {}).get(one.code, ROWS[one.code])
-
-
-def _told(alike: Sequence[Finding], setup: Setup) -> Told:
-    return Told(alike, setup, sentence, limit)
-
-
 def _line(alike: list[Finding], setup: Setup) -> str:
-    remedy = _row(alike[0], setup).remedy.format_map(_told(alike, setup))
+    remedy = Told(alike, setup).text("remedy")
     text = _sentence(alike, setup)
     return text + (("; " if ": " in text else ": ") + remedy if remedy else "")
 
 
 def _sentence(alike: list[Finding], setup: Setup) -> str:
     one = alike[0]
-    text = _row(one, setup).sentence.format_map(_told(alike, setup))
+    text = Told(alike, setup).text("sentence")
     if one.code in DEVIATIONS and one.others:
         others = ", or ".join(limit(other, setup) for other in one.others)
         text += f" (or {others}: the images do not tell)"

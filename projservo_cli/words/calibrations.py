@@ -38,7 +38,7 @@ OF_MODEL = {
         "the base of the arm or {all_cameras} moved{begin}, by {size}",
         _AGAIN,
     ),
-    "tool": Row("markers that moved on the tool", "{markers} moved on the tool{begin}, by {size}", _AGAIN),
+    "tool": Row("markers that moved {place}", "{markers} moved {place}{begin}, by {size}", _AGAIN),
     "lens": Row(
         "lens of the {view} camera",
         "the lens of the {view} camera distorts, by {size}",
@@ -270,5 +270,4 @@ ON_THE_TOOL = {
     "base": Row(
         "motion of the cameras on the tool", "the cameras moved on the tool{begin}, by {size}", _AGAIN
     ),
-    "tool": Row("markers that moved in the scene", "{markers} moved in the scene{begin}, by {size}", _AGAIN),
 }

@@ -16,7 +16,7 @@ OF_MOTION = {
     "outside_image": Row(
         "", "image fails first: a marker of the face is {amount} outside the {view} image {at}"
     ),
-    "behind_camera": Row("", "image fails first: a marker of the face is behind the {view} camera {at}"),
+    "motion_behind": Row("", "image fails first: a marker of the face is behind the {view} camera {at}"),
     "motion_joints": Row(
         "",
         "{nearest}joints{fails}: {joints} is at {amount}, its limits are {part} to {of_part}, {at}",

@@ -2,12 +2,13 @@
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from typing import NamedTuple
 
 import numpy as np
 
 from projservo_cli.findings import NOTE, Finding, Subject
-from projservo_cli.records import LIMITS_MISSING, TOOL, VIEWS, WORLD
+from projservo_cli.records import LIMITS_MISSING, TOOL
+from projservo_cli.words.runs import because
+from projservo_cli.words.table import Setup, row_of
 
 # Maximum number of names in a list of examples, and of runs of poses.
 _EXAMPLES, _MAX_RUNS = 3, 4
@@ -16,6 +17,7 @@ _UNITS = {
     "rad": (float(np.degrees(1.0)), "°"),
     "m": (1e3, " mm"),
     "s": (1.0, " s"),
+    "N": (1.0, " N"),
     "1": (1.0, ""),
     "": (1.0, ""),
 }
@@ -29,30 +31,24 @@ _ORIGINS = {
 }
 
 
-class Setup(NamedTuple):
-    """An arm and its cameras, as far as words depend on them."""
-
-    mount: str = WORLD
-    view: Sequence[str] = VIEWS
-    joints: int = 6  # number of the joints
-
-
 class Told:
     """Findings that one line tells, the first for all; values are looked up as in a dictionary."""
 
-    def __init__(
-        self,
-        alike: Sequence[Finding],
-        setup: Setup,
-        sentence: Callable[[Finding, Setup], str],
-        limit: Callable[[Finding, Setup], str],
-    ) -> None:
+    def __init__(self, alike: Sequence[Finding], setup: Setup) -> None:
         self.alike, self.setup, self.one = alike, setup, alike[0]
-        self.sentence, self.limit = sentence, limit
         self.joints = [joint for each in alike for joint in each.subject.joints]
 
     def __getitem__(self, name: str) -> object:
         return VALUES[name](self)
+
+    def text(self, part: str) -> str:
+        """Return the limit, sentence or remedy."""
+        text: str = getattr(row_of(self.one, self.setup), part)
+        return text.format_map(self)
+
+    def others(self, part: str) -> list[str]:
+        """Return the same of each of those that the first consists of."""
+        return [Told([one], self.setup).text(part) for one in self.one.others]
 
     @property
     def subject(self) -> Subject:
@@ -81,8 +77,8 @@ class Told:
 
 
 def quantity(value: float, unit: str, digits: int = 3) -> str:
-    """Format a number of a unit, angles in degrees and lengths in mm."""
-    factor, name = _UNITS[unit]
+    """Format a number of a unit, angles in degrees and lengths below 1 m in mm."""
+    factor, name = (1.0, " m") if unit == "m" and abs(value) >= 1.0 else _UNITS[unit]
     return f"{factor * value:.{digits}g}{name}"
 
 
@@ -93,7 +89,7 @@ def joined(words: Iterable[object]) -> str:
 
 
 def _joints(told: Told) -> str:
-    everything = told.one.code == "scale" and not told.single
+    everything = (told.one.code == "scale" and not told.single) or not told.joints
     return "all joints" if everything else numbered("joint", told.joints)
 
 
@@ -174,6 +170,48 @@ def _shared(others: Sequence[Finding]) -> str:
     return ""
 
 
+def _cameras(told: Told) -> str:
+    """Name the cameras of some of the views."""
+    views, names = told.subject.views, told.setup.view
+    if 1 < len(views) == len(names) and told.one.code != "exchanged_cameras":
+        return "both cameras" if len(views) == 2 else "all cameras"
+    if told.one.code == "exchanged_cameras":
+        return f"{joined(f'the {view}' for view in views)} camera"
+    return f"the {joined(views)} camera{'s' * (len(views) > 1)}"
+
+
+def _alike(told: Told) -> str:
+    """Say what looks like a joint that slipped: motions of what it ends at, and a link that flexes."""
+    first, last = (
+        ("the base or the scene turned likewise", "what holds the cameras turned likewise on the tool")
+        if told.setup.mount == TOOL
+        else ("the base turned likewise", "the tool turned likewise in its holder")
+    )
+    ends = [first] * (told.joints == [1]) + [last] * (told.joints == [told.setup.joints])
+    return "".join(f" or {what}" for what in ends + ["its link flexes"] * bool(told.one.others))
+
+
+def _left(told: Told) -> str:
+    """Say what is left of the translation, a share, and of the rotation, beside the error."""
+    each = [
+        f"{quantity(one.amount, one.unit)} of rotation"
+        if one.unit == "rad"
+        else f"{one.amount:.1%} of the translation"
+        for one in told.one.others
+    ]
+    return "".join(f"{text} and " for text in each)
+
+
+def _dark(told: Told) -> str:
+    """Say which cameras show no marker."""
+    dark, views = told.subject.views, told.setup.view
+    if len(dark) == 1:
+        return f"the {dark[0]} camera shows no marker"
+    if len(dark) == len(views):
+        return f"{'neither' if len(views) == 2 else 'no'} camera shows a marker"
+    return f"none of the cameras {', '.join(dark)} shows a marker"
+
+
 def _enough_see(told: Told) -> str:
     """Say how many cameras see the face that are to; ``limit`` is their number."""
     least, cameras = told.one.limit, len(told.setup.view)
@@ -230,7 +268,7 @@ VALUES: dict[str, Callable[[Told], object]] = {
     "shared": lambda told: _shared(told.one.others),
     "of_images": lambda told: _of_images(told.one.others),
     # Of what it consists of.
-    "unshown": lambda told: ", ".join(told.sentence(other, told.setup) for other in told.one.others),
+    "unshown": lambda told: ", ".join(told.others("sentence")),
     "rest": lambda told: f"{told.rest.amount:.0f}",
     "of_rest": lambda told: f"{told.rest.limit:.0f}",
     "part": lambda told: quantity(told.rest.amount, told.rest.unit),
@@ -248,7 +286,7 @@ VALUES: dict[str, Callable[[Told], object]] = {
     "since": lambda told: ", ".join(
         f"{one.subject.views[0]} from path parameter {one.amount:.2f}" for one in told.one.others
     ),
-    "stops": lambda told: ", ".join(told.limit(one, told.setup) for one in told.one.others),
+    "stops": lambda told: ", ".join(told.others("limit")),
     "speed_limit": lambda told: {"m": "prismatic_speed_limit_m_s"}.get(
         told.one.unit, "joint_speed_limit_deg_s"
     ),
@@ -258,6 +296,30 @@ VALUES: dict[str, Callable[[Told], object]] = {
         f"{one.amount:.0f}x{one.limit:.0f} {one.subject.views[0]}" for one in told.one.others
     ),
     "key": lambda told: {"m": "max_displacement_m"}.get(told.one.unit, "max_rotation_deg"),
+    # Of faults, and of reasons of runs.
+    "causes": lambda told: "; or ".join(
+        "; ".join(filter(None, parts))
+        for parts in zip(told.others("sentence"), told.others("remedy"), strict=True)
+    ),
+    "each": lambda told: joined(told.others("sentence")),
+    "place": lambda told: "in the scene" if told.setup.mount == TOOL else "on the tool",
+    "tag": lambda told: told.subject.tag,
+    "all_numbers": lambda told: ", ".join(map(str, told.subject.markers)),
+    "numbered": lambda told: numbered("marker", told.subject.markers),
+    "ends": lambda told: f"{told.subject.markers[0]} to {told.subject.markers[-1]}",
+    "covered": lambda told: ", or is covered in part" if len(told.setup.view) == 1 else "",
+    "cameras": _cameras,
+    "were": lambda told: "was" if len(told.subject.views) == 1 else "were",
+    "them": lambda told: "it" if len(told.subject.views) == 1 else "them",
+    "alike": _alike,
+    "ms": lambda told: " and ".join(f"{1e3 * one.amount:+.3g}" for one in told.one.others),
+    "larger": lambda told: "larger" if told.one.amount > 0.0 else "smaller",
+    "for_long": lambda told: (
+        f", {told.one.amount:.0f} periods after the last that was" if told.one.amount else ""
+    ),
+    "left": _left,
+    "because": lambda told: because(told.subject.name),
+    "dark": _dark,
     # Of arms of one joint, and of several.
     "elsewhere": lambda told: "markers farther from its axis" if told.alone else "trials of every joint",
     "by_itself": lambda told: "" if told.alone else f" in which {told['it']} moves alone",

@@ -7,7 +7,8 @@ import pytest
 
 from projservo_cli import records
 from projservo_cli.config.schema import json_schema, sweep_schema
-from projservo_cli.sweeps.runs import ALL_VERDICTS, BETWEEN, NUMBERED, measured_columns
+from projservo_cli.sweeps.runs import BETWEEN, NUMBERED, measured_columns
+from projservo_cli.words.runs import VERDICTS
 from tests.documentation.blocks import DOCS
 
 SCHEMAS = (json_schema(), sweep_schema())
@@ -56,7 +57,7 @@ def modes_and_profiles():
 
 
 NAMES = {
-    "verdicts": set(ALL_VERDICTS),
+    "verdicts": set(VERDICTS),
     "columns": columns(),
     "configuration": {*SCHEMAS[0]["properties"]},
     "sweep": {*SCHEMAS[1]["properties"]},
@@ -83,7 +84,7 @@ def test_names_of_the_glossary_stand_in_the_code():
     fields |= {name for kind in vars(records).values() for name in getattr(kind, "_fields", ())}
     # A test of the page on commands compares these with the output of the commands.
     output = set(re.findall(r"`(\w+)`", (DOCS / "reference" / "commands.md").read_text(encoding="utf-8")))
-    known = fields | output | keys() | columns() | set(ALL_VERDICTS)
+    known = fields | output | keys() | columns() | set(VERDICTS)
     known |= {value for schema in SCHEMAS for value in values(schema)}
     assert names() - known == set()
 

@@ -6,7 +6,7 @@ import pytest
 from projservo_cli.control.law import ERRORS, OK
 from projservo_cli.laws import CODES
 from projservo_cli.loop.python import BuiltInLaw, run_in_python
-from projservo_cli.loop.verdicts import VERDICTS
+from projservo_cli.loop.verdicts import VERDICT_NAMES
 from projservo_cli.simulation.analytic_plant import AnalyticPlant
 from tests.control.following import tracked
 from tests.loop.bits import FOLLOWING
@@ -27,7 +27,7 @@ def both(sc, law, bounds, noise, G=None, task=None, gains=GAINS):
     """Run of the compiled loop, to which that in Python is equal to the bit up to its last instant."""
     compiled = Run(sc, law, gains, bounds, noise, G, task=task)
     code, steps, log = in_python(sc, law, bounds, noise, G, task, gains)
-    assert (VERDICTS[code], steps) == (compiled.verdict, compiled.steps)
+    assert (VERDICT_NAMES[code], steps) == (compiled.verdict, compiled.steps)
     for name, rows in compiled.full._asdict().items():
         if name not in ("M", "scratch"):  # workspaces of the compiled loop
             up_to = slice(None) if name == "events" else slice(steps + 1)
@@ -104,7 +104,7 @@ def test_a_law_of_others():
     law = Towards(sc.q_goal)
     plant = AnalyticPlant(sc.plant, sc.q_start, np.zeros((200, 2, 4, 2)))
     verdict, steps, log = run_in_python(law, plant, sc.s_star, 0.04, limits(max_steps=199))
-    assert VERDICTS[verdict] == "converged"
+    assert VERDICT_NAMES[verdict] == "converged"
     assert law.calls == steps + 1
     # Each step leaves 0.8 of the joint error.
     assert log.q[10] - sc.q_goal == pytest.approx(0.8**10 * (sc.q_start - sc.q_goal), abs=1e-12)
@@ -134,7 +134,7 @@ def test_a_command_that_is_no_number_diverges():
     verdict, steps, _ = run_in_python(
         Towards(np.full(6, np.nan)), plant, sc.s_star, 0.04, limits(max_steps=3)
     )
-    assert (VERDICTS[verdict], steps) == ("diverged", 0)
+    assert (VERDICT_NAMES[verdict], steps) == ("diverged", 0)
 
 
 STOP = {"stop_at_joint_limit": True}
@@ -238,4 +238,4 @@ def test_a_disturbance_ends_the_run_before_any_other_verdict():
         plant = Bumped(sc.plant, sc.q_start, np.zeros((200, 2, 4, 2)))
         plant.at = at
         code, steps, _ = run_in_python(Towards(sc.q_goal), plant, sc.s_star, 0.04, ends)
-        assert (VERDICTS[code], steps, plant.sent) == (verdict, 0, ())
+        assert (VERDICT_NAMES[code], steps, plant.sent) == (verdict, 0, ())

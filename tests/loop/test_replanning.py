@@ -63,6 +63,11 @@ def watched(ways, clock=0.0, searches=3, blind=True, **bounds):
     )
 
 
+def told(attempt):
+    """Code, reason and step of an attempt."""
+    return attempt.code, attempt.subject.name, attempt.amount
+
+
 @pytest.mark.parametrize("verdict", [CONVERGED, BEHIND_CAMERA, WAITING, RUNNING])
 def test_most_verdicts_stay(verdict):
     ways = PathReplanner()
@@ -80,12 +85,12 @@ def test_what_stops_the_law_at_the_goal_has_it_shunned():
     np.testing.assert_array_equal(q, log.read[30])
     np.testing.assert_array_equal(excluded, [WAY[-1], log.read[30]])
     np.testing.assert_allclose(off, np.ones((2, 2)))
-    assert watch.attempts == ["at step 30 (a joint limit at the goal)"]
+    assert [told(one) for one in watch.attempts] == [("replanned", "joint limit", 30)]
     # Another goal that fails is excluded beside it; where there is no other way, the verdict stays.
     assert watch.ruled(log, 31, DIVERGED, np.zeros(2)) == WAITING
     assert watch.ruled(log, 32, JOINT_LIMIT, np.zeros(2)) == JOINT_LIMIT
     assert [len(excluded) for _, excluded, _ in ways.asked] == [2, 4, 6]
-    assert watch.attempts[-1] == "at step 32 (a joint limit at the goal) in vain"
+    assert told(watch.attempts[-1]) == ("replanned_in_vain", "joint limit", 32)
 
 
 def test_a_law_that_comes_no_nearer_at_the_goal_is_given_another_way():
@@ -94,7 +99,7 @@ def test_a_law_that_comes_no_nearer_at_the_goal_is_given_another_way():
     log.judged[:] = 3.0
     verdicts = [watch.ruled(log, k, RUNNING, np.zeros(2)) for k in range(40, 46)]
     assert verdicts == [RUNNING] * 4 + [WAITING, RUNNING]
-    assert watch.attempts == ["at step 44 (no progress at the goal)"]
+    assert [told(one) for one in watch.attempts] == [("replanned", "no progress", 44)]
 
 
 def test_what_is_ahead_is_looked_at_with_what_images_are_off():
@@ -118,7 +123,7 @@ def test_a_lost_face_is_sought_back_along_the_path():
         assert watch.law.state.parts[0] == 0  # what the law split its last step into is not sent
     assert watch.ruled(log, 52, RUNNING, q_dot) == WAITING
     assert followed == ["another way"]
-    assert "lost" in watch.attempts[0]
+    assert told(watch.attempts[0]) == ("replanned", "face_back", 52)
 
 
 def test_a_face_that_is_nowhere_on_the_way_back_is_lost():
@@ -144,7 +149,7 @@ def test_a_face_that_is_lost_again_is_passed_over_but_by_an_arm_that_must_not_mo
     np.testing.assert_allclose(q_dot, ((WAY[first] + WAY[first + 1]) / 2 - 0.25) / 0.5)
     if blind:
         assert watch.ruled(log, 61, RUNNING, q_dot) == RUNNING
-        assert watch.attempts[-1] == "passed over where the face is lost to step 61"
+        assert told(watch.attempts[-1]) == ("passed_over", "", 61)
         assert followed == ["another way"]
 
 
@@ -160,4 +165,4 @@ def test_joints_that_hide_the_face_at_the_end_are_excluded(count):
     np.testing.assert_array_equal(ways.asked[-1][1], WAY[-1:])
     assert verdicts == [RUNNING] * 6 + [WAITING if count == 2 else MARKERS_LOST]
     assert len(followed) == count
-    assert "the face is hidden at the end of the path" in watch.attempts[-1]
+    assert watch.attempts[-1].subject.name == "goal_hidden"

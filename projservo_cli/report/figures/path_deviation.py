@@ -9,6 +9,7 @@ from projservo_cli.laws import title_of
 from projservo_cli.records import FloatArray, Report, Trace
 from projservo_cli.report import style
 from projservo_cli.report.report_data import DIRECT, Data, ReportData, Studies, along_line, registered, title
+from projservo_cli.words.runs import arrived
 
 _PATH_POINTS = 400
 _WHIRL = np.pi  # with a longer joint step, rad or m, the arm winds up: its path is drawn at the instants only
@@ -37,7 +38,7 @@ def study_numbers(studies: Studies | None) -> dict[str, Any]:
     by_period = np.full((len(DIRECT), len(periods)), np.nan)
     for (law, operators, limited, gain), trace in (studies.sweep if studies is not None else {}).items():
         where = DIRECT.index(law), _OPERATORS.index(operators), int(limited), gains.index(gain)
-        converged[where] = trace.verdict == "converged"
+        converged[where] = arrived(trace.verdict)
         drift[where] = trace.center_deviation_mm  # None becomes NaN
         at_samples[where] = trace.center_deviation_at_samples_mm
     for (law, period), trace in (studies.rate if studies is not None else {}).items():

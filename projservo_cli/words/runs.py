@@ -1,0 +1,154 @@
+"""Verdicts of runs, and words for their reasons."""
+
+from typing import NamedTuple
+
+from projservo_cli.words.rows import Row
+
+
+class Verdict(NamedTuple):
+    """One way in which a run ends."""
+
+    when: str  # cause
+    remedy: str
+    arrived: bool = False  # the goal is reached
+    stopped: str = ""  # what stopped a law, for which another path is searched
+    ends: bool = False  # nothing is driven after it, in this call
+    refutes: bool = False  # images contradict the calibration
+    retried: bool = False  # a stored run is made again
+
+
+# In the order of the codes of the loop; the last two are of sweeps.
+VERDICTS = {
+    "behind camera": Verdict("a marker is not in front of a camera", "choose another goal or start"),
+    "out of view": Verdict(
+        "a marker is outside an image, and stop.image_border is stop", "plan a path that keeps it inside"
+    ),
+    "markers lost": Verdict(
+        "the law needs a marker that was not seen", "look what covers it, and at light and exposure"
+    ),
+    "converged": Verdict("the image error is within the tolerance", "", arrived=True),
+    "diverged": Verdict(
+        "the image error or the distance of the face grew by a factor, or the command is not finite",
+        "follow a plan, or take another law",
+        stopped="growing errors",
+    ),
+    "singular": Verdict(
+        "the joint motion of the law is not unique", "follow a plan around it", stopped="a singularity"
+    ),
+    "no progress": Verdict(
+        "the error fell by less than 1 % in the last window", "follow a plan, or raise speeds"
+    ),
+    "max steps": Verdict("no step is left", "raise stop.max_steps, or control.gain"),
+    "joint limit": Verdict(
+        "a joint stands at its limit, the command would take it beyond, and stop.joint_limits is stop",
+        "follow a plan that keeps the limits",
+        stopped="a joint limit",
+    ),
+    "fault detected": Verdict(
+        "images contradict the calibration, or the tool presses too hard",
+        "put back what moved, or calibrate again",
+        refutes=True,
+    ),
+    "failed": Verdict(
+        "law, robot or cameras failed during the run", "mend what failed", ends=True, retried=True
+    ),
+    "following error": Verdict("a joint stays off its set-point", "look whether it is blocked"),
+    "object moved": Verdict(
+        "the object that carries the goal moved", "let it lie still, and plan again", ends=True
+    ),
+    "not calibrated": Verdict("a run of a sweep has no calibration", "look why it is refused"),
+    "not started": Verdict("a run of a sweep could not begin", "read its reason"),
+}
+# Why another path is searched, but for what stopped the law.
+_REPLANNED = {
+    "face_back": "the face was lost, and seen again on the path backwards",
+    "ahead": "the path ahead would leave an image",
+    "goal_hidden": "the face is hidden at the end of the path",
+}
+REASONS = {
+    "converged": Row("", "{name} {amount} is within {limit}"),
+    "no_progress": Row("", "no progress at an {name} of {amount}: {causes}"),
+    "max_steps": Row("", "no step left; {name} {amount} was still changing"),
+    "error_grew": Row("", "{name} {amount} is more than {part} times that at first, {limit}"),
+    "face_left": Row("", "the face is {amount} from the cameras, over {part} times the {limit} at first"),
+    "not_finite": Row("", "the command at step {count} is not finite"),
+    "out_of_view": Row("", "a face marker left an image at step {count}"),
+    "behind_camera": Row("", "a face marker passed behind a camera at step {count}"),
+    "markers_lost": Row("", "the law could not measure the face at step {count}: {causes}"),
+    "marker_unseen": Row("", "a marker was not seen{for_long}"),
+    "marker_flickers": Row(
+        "",
+        "a marker was not seen in {count} of the last {total} periods, with the robot held meanwhile",
+        "look at light and exposure there, or at what covers it",
+    ),
+    "joint_limit": Row("", "{joints} stands at its limit, {amount}, and the task would take it beyond"),
+    "singular": Row("", "the joint motion was not unique at step {count}: the robot is near a singularity"),
+    "remaining": Row("", "{left}an {name} of {amount} is left"),
+    "vague_markers": Row("", "markers there state {amount} times the noise", "look what covers them"),
+    "face_apart": Row(
+        "",
+        "the face itself is seen {amount} off ({limit} by noise): it moved on the tool since the goal was "
+        "taught",
+        "teach it again",
+    ),
+    "blind_camera": Row(
+        "", "the {view} camera has shown no marker of the face since step {count}", "check it"
+    ),
+    "replanned": Row("", "replanned at step {count} ({because})"),
+    "replanned_in_vain": Row("", "replanned at step {count} ({because}) in vain"),
+    "passed_over": Row("", "passed over where the face is lost to step {count}"),
+    "local_minimum": Row("", "the law asks for no motion there, a local minimum"),
+    "slow_commands": Row(
+        "",
+        "commands are too slow, {percent} % of the way in a period",
+        "raise plant.speed_scale, the limits of joint speeds, control.period_s, or stop.stall_periods",
+    ),
+    "coarse_motion": Row(
+        "",
+        "set-points moved by no more than {amount}: backlash, coarse set-points or coarse readings hide the "
+        "rest",
+    ),
+    "joint_stays": Row(
+        "",
+        "{joints} stands at {amount}, {limit} off its set-point",
+        "look whether it is blocked, braked or in a protective stop, or raise "
+        "plant.max_steady_state_error_deg or plant.max_relative_target_deg",
+    ),
+    "small_steps": Row(
+        "",
+        "set-points of {joints} moved by {amount}, its readings by {limit}: it does not follow such small "
+        "steps; coarse set-points, or friction",
+    ),
+    "no_gain": Row(
+        "",
+        "set-points of {joints} moved by {amount}, its readings by {limit}, and images show no gain: "
+        "backlash, or coarse set-points",
+    ),
+    "pressed": Row(
+        "",
+        "the tool is pressed with {amount}, beyond the {limit} of stop.max_force_n",
+        "see what it touches",
+    ),
+    "moved_object": Row(
+        "",
+        "the object {name}, markers {ends}, has moved since the motion was planned, by {amount} in the "
+        "{view} image ({limit} at most)",
+        "let it lie still, and plan again",
+    ),
+    "unseen_markers": Row("", "{dark} of the calibration"),
+}
+
+
+def because(name: str) -> str:
+    """Return why another path was searched, by the verdict that stopped the law or another cause."""
+    return _REPLANNED[name] if name in _REPLANNED else VERDICTS[name].stopped or name
+
+
+def meaning(verdict: str) -> Verdict:
+    """Return a verdict by its name, which may be of a run file of another version."""
+    return VERDICTS.get(verdict, Verdict("unknown here", "update projservo"))
+
+
+def arrived(verdict: str) -> bool:
+    """Whether a run that ended in a verdict reached the goal."""
+    return meaning(verdict).arrived

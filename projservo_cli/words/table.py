@@ -1,0 +1,33 @@
+"""All rows of words by their codes, and the row for an arm and its cameras."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from projservo_cli.findings import Finding
+from projservo_cli.records import TOOL, VIEWS, WORLD
+from projservo_cli.words import calibrations, monitoring, plans, runs
+from projservo_cli.words.rows import Row
+
+ROWS: dict[str, Row] = (
+    calibrations.OF_MODEL
+    | calibrations.CALIBRATION
+    | calibrations.REFUSALS
+    | plans.PLANS
+    | monitoring.FAULTS
+    | runs.REASONS
+)
+_ON_THE_TOOL = calibrations.ON_THE_TOOL | monitoring.ON_THE_TOOL
+
+
+class Setup(NamedTuple):
+    """An arm and its cameras, as far as words depend on them."""
+
+    mount: str = WORLD
+    view: Sequence[str] = VIEWS
+    joints: int = 6  # number of the joints
+
+
+def row_of(one: Finding, setup: Setup) -> Row:
+    """Return the row of a finding."""
+    special = _ON_THE_TOOL if setup.mount == TOOL else monitoring.BY_ONE if len(setup.view) == 1 else {}
+    return special.get(one.code, ROWS[one.code])
