@@ -2,6 +2,7 @@
 
 import dataclasses
 import inspect
+import re
 import types
 import typing
 from collections.abc import Callable, Iterator
@@ -10,18 +11,15 @@ from typing import Any
 import click
 
 from docs.generate import keys, python
-from docs.generate.markdown import table, text
+from docs.generate.markdown import escaped, table, text
 from projservo_cli import records
 from projservo_cli.cli import main
 from projservo_cli.cli.equations import REGISTER
 from projservo_cli.config.schema import json_schema, sweep_schema
-from projservo_cli.findings import DEVIATIONS, LIMITS, NOTE, Finding, Subject
 from projservo_cli.loop import verdicts as loop_verdicts
 from projservo_cli.sweeps.runs import BETWEEN, NUMBERED, measured_columns
-from projservo_cli.words import ROWS, line, sentence
-from projservo_cli.words.plans import PLANS
+from projservo_cli.words import ROWS
 from projservo_cli.words.runs import VERDICTS
-from projservo_cli.words.table import Setup
 
 # Where a run file holds which record.
 GROUPS = {
@@ -139,58 +137,20 @@ def verdicts() -> Iterator[str]:
     yield from python.markdown(inspect.cleandoc(loop_verdicts.__doc__ or "").split("\n\n", 1)[1])
 
 
-def example(code: str) -> Finding:
-    """A finding of a code with values for all that its words may name."""
-    texts, counted = "".join(ROWS[code]), ("{count}", "{total}", "{times}")
-    of_joints = ("joint", "quadratic", "cubic", "harmonic", "sag", "little", "circular", "turned")
-    unit, amount, limit, deviation = "px", 0.6, 0.2, 0.1
-    of_path = ("margin_joints", "motion_joints", "object_far")
-    if code in PLANS and code not in of_path and not any(name in texts for name in counted):
-        pixels = code in ("motion_border", "outside_image") or code.startswith("margin_")
-        unit, amount, limit = "px" if pixels else "1", 0.06, 0.05
-    elif any(name in texts for name in counted):
-        unit, amount, limit = "1", 12.0, 400.0
-    elif code in ("scale", "coupling") or "{percent}" in texts:
-        unit, amount, deviation = "1", 0.02, 0.001
-    elif any(word in code for word in of_joints):
-        unit, amount, deviation, limit = "rad", 0.0349, 0.00175, 0.2
-    names = {"unused_start": "arm.json", "rejected_poses": "first", "placeholders": "u = 9999"}
-    names |= dict.fromkeys(("rejected_profile", "face_turned"), "linear") | {"object_far": "tray"}
-    names |= dict.fromkeys(("relaxed", "within_region"), "start")
-    names |= {"replanned": "joint limit", "replanned_in_vain": "ahead", "moved_object": "tray"}
-    names |= {"other_mount": "tool", "joint_type": "RPR", "whole_seconds": "t_q"}
-    joints = (2, 3) if code in ("coupling", "undecided_order") else (2,)
-    subject = Subject(joints, ("left", "right"), (5, 6), None, (7, 9), names.get(code, "views"))
-    of_part = Subject(views=("left",)) if code == "turned_board" else Subject(markers=(5,))
-    others = (Finding("noise", NOTE, of_part, 9.0, limit=12.0, unit="1"),) * 2
-    if code in ("relaxed", "no_path", "start_beyond"):
-        others = (
-            Finding("margin_image", subject=Subject(views=("left",)), amount=3.0, limit=8.0, unit="px"),
-        )
-    elif code == "rejected_profile":
-        others = (Finding("no_coupled_path"),)
-    elif code in PLANS:
-        at = (("mu_t", 0.8), ("mu_r", 0.5), ("mu_p", 0.5))
-        share = {"joint_path": 2.0, "goals_hidden": 3.0, "unknown_image_size": 640.0}.get(code, 0.5)
-        parts = (Finding("share", subject=Subject(views=("left",)), amount=share, limit=480.0, unit="1"),)
-        moved = (Finding("share", subject=Subject(name=name), amount=amount) for name, amount in at)
-        others = tuple(moved) if "{at}" in texts else parts
-        if code == "motion_joints":
-            others = (Finding("range", amount=-0.785, limit=0.035, unit="rad"), *others)
-    if code == "unshown":
-        others = (Finding("sag", subject=Subject(joints=(3,)), amount=0.01, unit="rad"),)
-    return Finding(code, LIMITS, subject, amount, deviation, limit, unit, 1.5, others)
-
-
 def findings() -> Iterator[str]:
-    """All findings by their codes, each with an example and its remedy."""
-    rows = []
-    for code in (code for code in ROWS if code != "told"):
-        one, setup = example(code), Setup()
-        one = dataclasses.replace(one, others=()) if code in DEVIATIONS else one
-        said, whole = sentence(one, setup), line(one, setup)
-        rows.append((f"`{code}`", text(said), text(whole.removeprefix(said).lstrip(";: "))))
-    yield from table(("code", "as in", "remedy"), rows)
+    """All findings by their codes with their sentences; values that depend on the finding are in italics."""
+    rows = ((f"`{code}`", _pattern(row.sentence), _pattern(row.remedy)) for code, row in ROWS.items())
+    yield from table(("code", "sentence", "remedy"), rows)
+
+
+def _pattern(sentence: str) -> str:
+    """A text of a row, its values by their names."""
+    plain, *rest = re.split(r"\{(\w+)[^}]*\}", sentence)
+    named = "".join(
+        f" *{name.replace('_', ' ')}* {escaped(after)}"
+        for name, after in zip(rest[::2], rest[1::2], strict=True)
+    )
+    return re.sub(r" ([ ,;:)]|$)", r"\1", escaped(plain) + named).replace("( *", "(*").strip()
 
 
 WRITERS: dict[str, Callable[[], Iterator[str]]] = {

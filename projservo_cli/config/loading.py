@@ -254,10 +254,10 @@ class Override:
         return tuple(int(step) if step.isdecimal() and i else step for i, step in steps)
 
     @classmethod
-    def parse(cls, text: str) -> "Override":
+    def parse(cls, setting: str) -> "Override":
         """Read ``a.b=v`` of ``--set``; the value is YAML."""
-        flag = f"--set {text}"
-        key, sign, value = text.partition("=")
+        flag = f"--set {setting}"
+        key, sign, value = setting.partition("=")
         steps = [step.strip() for step in key.split(".")]
         if not sign or not all(steps):
             raise InputError(f"{flag}: expected KEY=VALUE, with a key such as control.gain_t")

@@ -6,13 +6,9 @@ from projservo_cli.words.rows import Row
 _CURVE, _AGAIN = "fit it (--joint-model auto), or mend the joint", "fix what moved, and record again"
 OF_MODEL = {
     "scale": Row("gear of {joints}", "{joints} {moves} {size} {more} than {reads}", _CURVE),
-    "quadratic": Row(
-        "curve of {joints}", "readings of {joints} follow a curve, off by {size} at the ends", _CURVE
-    ),
-    "cubic": Row(
-        "curve of {joints}",
-        "readings of {joints} follow a curve, off by {size} at the ends",
-        _CURVE,
+    **dict.fromkeys(
+        ("quadratic", "cubic"),
+        Row("curve of {joints}", "readings of {joints} follow a curve, off by {size} at the ends", _CURVE),
     ),
     "harmonic": Row(
         "eccentric encoder of {joints}", "readings of {joints} swing by {size} once a turn", _CURVE
