@@ -50,13 +50,6 @@ def _calibration_words(values: Mapping[str, Any], *, estimated: bool) -> Iterato
             + (" The noise is itself an estimate from these images." if estimated else "")
         )
     yield _worst_joint(values)
-    for name, noun, singular, plural in (
-        ("outliers", "observation", "rejected as an outlier", "rejected as outliers"),
-        ("suspect_joint_readings", "joint reading", "contradicts the images", "contradict the images"),
-        ("id_switches", "marker", "was renumbered", "were renumbered"),
-    ):
-        if count := len(values[name]):
-            yield f"{count} {noun}{'s' * (count > 1)} {plural if count > 1 else singular}."
     if "cross_validation" in values:
         held_out = values["cross_validation"]
         names = ("rms_px", "predicted_rms_px", "median_px", "p95_px")

@@ -195,7 +195,6 @@ def test_what_is_known_of_a_calibration_is_told(run, tmp_path):
         "an estimate from these images",
         "Joint 2 is known worst: 0.5 rad from the reference it adds 7.25 times",
         "so this one is poorly observable.",
-        "2 observations rejected as outliers. 1 joint reading contradicts the images.",
         "Held out, in 5 parts of poses: rms 0.321 px",
         "As predicted.",
         "What to do next: move joint 2",
