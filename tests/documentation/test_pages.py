@@ -17,6 +17,7 @@ from projservo_cli import cli
 from projservo_cli.config import load_config
 from projservo_cli.report import animation as film
 from projservo_cli.simulation.mjcf import mujoco
+from projservo_cli.words.table import ROWS
 from tests.configured import draw_only, truth_of
 from tests.detection.rendering import render, square
 from tests.documentation.blocks import PAGES, ROOT, blocks_of, run_page
@@ -312,6 +313,7 @@ def test_messages_of_the_troubleshooting_page_stand_in_the_sources():
         path.read_text(encoding="utf-8") for path in sorted((ROOT / "projservo_cli").rglob("*.py"))
     )
     joined = re.sub(r'["\']\s*(?:\+ )?f?["\']', "", sources)
+    joined += " ".join(f"{row.sentence}{by} {row.remedy}" for row in ROWS.values() for by in ":;")
     rows = [line.split("|") for line in PAGES["troubleshoot"].read_text(encoding="utf-8").splitlines()]
     said = [piece for row in rows if len(row) == 5 for piece in re.findall(r"`([^`]*)`", row[2])]
     pieces = [part.strip() for piece in said for part in piece.split("…") if part.strip()]

@@ -183,8 +183,8 @@ def calibrated():
         (lambda s: _with_noise(s, 0.2), "agrees with the images, which show the tool within 0."),
         (lambda s: s[::-1], "exchanged"),
         (lambda s: s + np.array([[[12.0, 0.0]], [[0.0, 0.0]]]), "the left camera"),
-        (lambda s: _tag(s, 1, np.roll(s[:, 4:8], 2, axis=1)), "tag 1 is upside down on the tool; put"),
-        (lambda s: _tag(_tag(s, 1, s[:, 12:16]), 3, s[:, 4:8]), "tags 1 and 3 are exchanged on the tool"),
+        (lambda s: _tag(s, 1, np.roll(s[:, 4:8], 2, axis=1)), "tag 1 is turned by 180° on the tool: put"),
+        (lambda s: _tag(_tag(s, 1, s[:, 12:16]), 3, s[:, 4:8]), "tags 1, 3 are exchanged on the tool"),
         (lambda s: _tag(s, 2, s[:, 8:12] + 15.0), "tag 2 (markers 8, 9, 10, 11) moved on the tool"),
         (
             lambda s: _scaled(s, 0.94),

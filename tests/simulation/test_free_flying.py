@@ -14,7 +14,7 @@ from projservo_cli.control.law import Gains
 from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.laws import CODES
 from projservo_cli.loop.python import BuiltInLaw, run_in_python
-from projservo_cli.loop.verdicts import VERDICTS, Limits
+from projservo_cli.loop.verdicts import VERDICT_NAMES, Limits
 from projservo_cli.records import Model, no_lenses, position_limits
 from projservo_cli.simulation.analytic_plant import AnalyticPlant, Plant
 from projservo_cli.simulation.arm import METRIC_A_INF
@@ -82,7 +82,7 @@ def drive(law, perturbation, max_steps=3000):
     rig = FreeFlying(plant, np.zeros(6), np.zeros((max_steps + 1, 2, 5, 2)))
     built_in = BuiltInLaw(CODES[law], plant.model, task, gains)
     verdict, steps, log = run_in_python(built_in, rig, task.s_star, PERIOD, ends)
-    return VERDICTS[verdict], steps, log
+    return VERDICT_NAMES[verdict], steps, log
 
 
 @pytest.mark.parametrize(("law", "steps"), [("stacked", 519), ("euclidean_points", 775)])
