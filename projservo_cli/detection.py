@@ -14,6 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import ndtr
 
+from projservo_cli import words
+from projservo_cli.findings import REFUSES, Finding, Subject
 from projservo_cli.image_size import natural
 from projservo_cli.records import (
     CORNERS,
@@ -23,9 +25,9 @@ from projservo_cli.records import (
     InputError,
     JointList,
     Observation,
-    WorkFailed,
     board_numberings,
 )
+from projservo_cli.words.table import Setup
 
 DICTIONARY = "4X4_50"
 """Of tags, where none is given."""
@@ -91,17 +93,17 @@ def _images_or_not(source: str) -> list[Path]:
     return [file for file in named if file.is_file()]
 
 
-def unfit(image: Any) -> str:
-    """Tell why an image as it was read shows no grey values of a scene, with the remedy; empty if it does."""
+def unfit(image: Any) -> Finding | None:
+    """Tell why an image as it was read shows no grey values of a scene; None if it does."""
     if image.dtype != np.uint8:
-        return f"has {8 * image.dtype.itemsize} bits a pixel: save it with 8, the brightest part near 255"
+        return Finding("deep_pixels", REFUSES, amount=8 * image.dtype.itemsize, limit=8)
     if image.ndim > 2 or min(image.shape) < 2:
-        return ""
+        return None
     even = image[: image.shape[0] // 2 * 2, : image.shape[1] // 2 * 2]
     cells = even.reshape(len(even) // 2, 2, -1, 2).mean(axis=(0, 2), dtype=np.float64)
     if np.ptp(cells) > max(1.0, _MOSAIC * cells.mean()):
-        return "is the mosaic of a colour sensor (Bayer): turn it into grey values or colours first"
-    return ""
+        return Finding("mosaic", REFUSES)
+    return None
 
 
 def _named(source: str, names: Sequence[str], where: str) -> list[Path]:
@@ -517,7 +519,6 @@ class Finder(ABC):
     """
 
     corners: int
-    nothing: str  # what is in no image, with the remedy
 
     def __init__(self) -> None:
         self.cv = opencv()
@@ -533,9 +534,9 @@ class Finder(ABC):
         """Return tags numbered as in the frame before, where a board looks the same from several ends."""
         return tags
 
-    def absent(self, paths: Sequence[Path]) -> str:
-        """Say that there is nothing in images of files, with the remedy."""
-        return self.nothing.format(count=len(paths))
+    def absent(self, paths: Sequence[Path]) -> Finding:
+        """Return that there is nothing in images of files."""
+        return Finding("no_tags", REFUSES, amount=len(paths), unit="1")
 
     def mirrored(self, paths: Sequence[Path]) -> int:
         """Number of images of files that show something when they are mirrored."""
@@ -554,7 +555,7 @@ class Finder(ABC):
         if image is None:
             raise InputError(f"{path}: not an image that OpenCV can read; save it again, as PNG for example")
         if wrong := unfit(image):
-            raise InputError(f"{path}: {wrong}")
+            raise InputError(f"{path}: {words.line(wrong)}")
         if image.ndim > 2:
             flags = self.cv.IMREAD_GRAYSCALE | self.cv.IMREAD_IGNORE_ORIENTATION
             image = self.cv.imdecode(content, flags)
@@ -570,10 +571,6 @@ class TagFinder(Finder):
     """
 
     corners = CORNERS
-    nothing = (
-        "no tag in any of {count} images: check that --dictionary is that of your tags, and that a bright "
-        "margin of one cell surrounds each"
-    )
 
     def __init__(self, dictionary: str) -> None:
         super().__init__()
@@ -670,10 +667,6 @@ class BoardFinder(Finder):
     def __init__(self, board: Board, dictionary: str) -> None:
         super().__init__()
         self.board, self.corners = board, math.prod(board.shape)
-        self.nothing = (
-            f"no {board} in any of {{count}} images: check its kind and that it is counted in inner corners "
-            "(chessboard) or squares (charuco), columns before rows, and show each side of a chessboard"
-        )
         self._detectors, self._numbers = [], np.empty(0, dtype=np.int64)
         if board.kind == "charuco":
             tags, needed = _dictionary(dictionary), board.rows * board.columns // 2
@@ -697,8 +690,8 @@ class BoardFinder(Finder):
         """Number of images of files that show the board when they are mirrored, if it has tags."""
         return super().mirrored(paths) if self._detectors else 0
 
-    def absent(self, paths: Sequence[Path]) -> str:
-        """Say that the board is in no image, and which other tags of its dictionary are."""
+    def absent(self, paths: Sequence[Path]) -> Finding:
+        """Return that the board is in no image, and which other tags of its dictionary are."""
         seen = set[int]()
         if self._detectors:
             finder = self.cv.aruco.ArucoDetector(self._detectors[0].getBoard().getDictionary(), _parameters())
@@ -706,13 +699,12 @@ class BoardFinder(Finder):
                 numbers = finder.detectMarkers(self.read(path).astype(np.uint8))[1]
                 seen |= set() if numbers is None else {*np.ravel(numbers).tolist()}
         if seen <= {*self._numbers.tolist()}:
-            return super().absent(paths)
-        low, high = self._numbers[[0, -1]]
-        return (
-            f"no {self.board} in any of {len(paths)} images, but tags {min(seen)} to {max(seen)} of its "
-            f"dictionary, and the board has {low} to {high}: name its first tag, --board "
-            f"{self.board._replace(first=min(seen))} or markers.board.first: {min(seen)}"
-        )
+            return Finding("no_board", REFUSES, Subject(name=str(self.board)), len(paths), unit="1")
+        low, high = self._numbers[[0, -1]].tolist()
+        tags = Finding("tags", amount=min(seen), limit=max(seen), unit="1")
+        board = Finding("board", subject=Subject(name=str(self.board._replace(first=min(seen)))))
+        own = Subject(name=str(self.board), markers=(low, high))
+        return Finding("other_board", REFUSES, own, len(paths), unit="1", others=(tags, board))
 
     def find(self, image: FloatArray) -> tuple[dict[int, Corners], tuple[int, ...]]:
         """Corners (N, …) of the board in an image as tag 0, NaN where unseen; none without it.
@@ -1059,17 +1051,12 @@ def observe_tags(
         progress("detect", k + 1, len(pairs))
     for view in sorted({*range(len(cameras))} - {view for _, view, _ in findings.images}):
         if count := finder.mirrored([views[view] for _, *views in pairs]):
-            raise WorkFailed(
-                f"the {cameras[view]} images are mirrored: {count} of {len(pairs)} show tags in the mirror, "
-                "and none as they are: switch mirroring off in the driver, or mirror the files"
-            )
+            where = Subject(views=(cameras[view],))
+            raise words.failed([Finding("mirrored_files", REFUSES, where, count, limit=len(pairs), unit="1")])
     if not findings.images and findings.ambiguous:
-        raise WorkFailed(
-            f"each tag is more than once in its image, {findings.ambiguous} in all, and rejected: a number "
-            "must be unique: print another one, or cover the tag that is not on the tool"
-        )
+        raise words.failed([Finding("all_repeated", REFUSES, amount=findings.ambiguous, unit="1")])
     if not findings.images:
-        raise WorkFailed(finder.absent([path for _, *views in pairs for path in views]))
+        raise words.failed([finder.absent([path for _, *views in pairs for path in views])])
     numbers, each = findings.tags, finder.corners if points == "corners" else 1
     values = np.full((len(pairs), len(cameras), len(numbers), each, 3), np.nan)
     for (k, view, number), pixels in findings.images.items():
@@ -1080,15 +1067,9 @@ def observe_tags(
     images, sigma = values[..., :2], values[..., 2]
     observation = Observation(pose, marker, q, images, sigma=sigma, view=tuple(cameras))
     if not np.isfinite(images).any():
-        raise WorkFailed(
-            f"all {images[..., 0].size} markers that were found are rejected, since their edges are not "
-            "clean: look for occlusion, blur, or cells of few pixels"
-        )
+        raise words.failed([Finding("rejected_markers", REFUSES, amount=images[..., 0].size, unit="1")])
     if len(cameras) > 1 and (np.isfinite(images[..., 0]).sum(axis=1) < 2).all():
-        both = "both" if len(cameras) == 2 else "two"
-        raise WorkFailed(
-            f"no tag was seen by {both} cameras at the same pose: check the pairing of the images"
-        )
+        raise words.failed([Finding("unpaired_images", REFUSES)], Setup(view=cameras))
     return observation, findings
 
 

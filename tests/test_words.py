@@ -12,7 +12,7 @@ from projservo_cli.words import table
 
 VIEWS = ("left", "right", "top", "far side")
 COUNTED = Finding(
-    "id_switches", subject=Subject(views=("left",), markers=(5,)), amount=3.0, limit=9.0, unit="1"
+    "id_switches", subject=Subject((), ("left",), (5,), 1, (), "tray"), amount=3.0, limit=9.0, unit="1"
 )
 
 
@@ -32,7 +32,8 @@ def test_each_finding_has_words_whatever_the_arm_and_the_cameras(code):
         setup = table.Setup(mount, VIEWS[:count], 1 if count == 1 else 6)
         if code in DEVIATIONS:
             one = Finding(**vars(one) | {"others": (finding("joint_step", unit), finding("base", unit))})
-        for text in (words.line(one, setup), words.limit(one, setup)):
+        row = words.row(one, setup)
+        for text in (words.line(one, setup), words.limit(one, setup), *row.values()):
             assert not re.search(r"\{\w*\}|\bnan\b|  |None", text), text
         line = words.line(one, setup)
         told = line.split(" (or ")[0]

@@ -41,7 +41,7 @@ from projservo_cli.calibration.prediction import (
 )
 from projservo_cli.calibration.robust_fit import MAX_PREDICTED, REFUSE_RATIO, inverse_root
 from projservo_cli.calibration.views import resected
-from projservo_cli.findings import LIMITS, REFUSES, Finding, Subject
+from projservo_cli.findings import LIMITS, NOTE, REFUSES, Finding, Subject
 from projservo_cli.geometry.lens import TERMS, undistort
 from projservo_cli.image_size import ImageSize, image_sizes
 from projservo_cli.records import (
@@ -56,7 +56,7 @@ from projservo_cli.records import (
     WorkFailed,
     apart,
 )
-from projservo_cli.words import with_findings
+from projservo_cli.words import failed, with_findings
 from projservo_cli.words.values import quantity
 
 # Minimum number of detections: a camera has 11 numbers, and as many are left to judge them.
@@ -102,10 +102,10 @@ class _ViewError(NamedTuple):
         return self.off_px > _DISAGREES * self.expected_px
 
     @property
-    def text(self) -> str:
-        """Distance and limit in words."""
-        limit = _DISAGREES * self.expected_px
-        return f"the {self.view} images are {self.off_px:.3g} px off ({limit:.3g} px allowed)"
+    def finding(self) -> Finding:
+        """Distance and limit."""
+        limit, severity = _DISAGREES * self.expected_px, LIMITS if self.disagrees else NOTE
+        return Finding("view_off", severity, Subject(views=(self.view,)), self.off_px, limit=limit, unit="px")
 
 
 def view_errors(calibration: Calibration, observation: Observation) -> tuple[_ViewError, ...]:
@@ -262,8 +262,8 @@ def _require_moved(images: _Images, view: str) -> None:
     views = images.errors_of_views(parameters_from(c), errors_of(c))
     of_view = views[c.view.index(view)]
     if np.isfinite(of_view.off_px) and not of_view.disagrees:
-        seen = ", ".join(one.text for one in views if np.isfinite(one.off_px))
-        raise WorkFailed(f"the {view} camera has not moved, and its calibration is kept: {seen}")
+        seen = tuple(one.finding for one in views if np.isfinite(one.off_px))
+        raise failed([Finding("unmoved_camera", REFUSES, Subject(views=(view,)), others=seen)])
 
 
 def since_moved(old: Observation, new: Observation, view: str) -> Observation:
@@ -372,10 +372,7 @@ def _require_confirmed(camera: _Camera) -> float:
     name, errors = found.view[v], errors_of_others(c, v)
     for one in images.errors_of_views(params, errors):
         if one.view != name and one.disagrees:
-            raise WorkFailed(
-                f"{one.text} at these joint readings: they are wrong, or that camera moved as well; home the "
-                "joints, or calibrate again"
-            )
+            raise failed([Finding("other_view_off", REFUSES, others=(one.finding,))])
     near = np.linalg.norm(problem.residual(params), axis=2) <= OUTLIER * images.deviation(params, errors)
     mask = camera.used | (found.seen & near & (np.arange(len(found.seen)) != v)[:, None])
     mask &= np.isin(found.marker_of, even_choice(found.marker.size, MAX_JUDGED))

@@ -163,12 +163,12 @@ def doctor(
             progress=console.progress,
         )
         pictures = {} if checked.seen is None else _pictures(settings, checked.seen)
-        write_whole(output, preflight_page(settings.name, checked.findings, pictures))
+        write_whole(output, preflight_page(settings.name, checked.rows, pictures))
     refit = _refit(checked, stored, config, output)
     value = {
         "page": output.resolve(),
         "works": checked.works,
-        "findings": [finding._asdict() for finding in checked.findings],
+        "findings": checked.rows,
         "refit": refit,
     }
     console.report(value, [*_table(checked), f"page: {output}", *(refit["commands"] if refit else ())])
@@ -213,13 +213,13 @@ _QUESTION = (
 
 
 def _table(checked: "Checked") -> Iterator[str]:
-    width = max(len(finding.where) for finding in checked.findings)
-    for finding in checked.findings:
-        head = f"{finding.level:8}{finding.where:{width + 2}}"
-        yield head + wrapped(finding.text, " " * len(head))[len(head) :]
-        if finding.remedy:
-            yield wrapped(finding.remedy, " " * len(head))
-    faults = sum(finding.level == "fault" for finding in checked.findings)
+    width = max(len(row["where"]) for row in checked.rows)
+    for row in checked.rows:
+        head = f"{row['level']:8}{row['where']:{width + 2}}"
+        yield head + wrapped(row["text"], " " * len(head))[len(head) :]
+        if row["remedy"]:
+            yield wrapped(row["remedy"], " " * len(head))
+    faults = sum(row["level"] == "fault" for row in checked.rows)
     mend = f"doctor: {faults} fault{'s' * (faults > 1)} to mend before recording"
     yield "doctor: ready to record" if checked.works else mend
 

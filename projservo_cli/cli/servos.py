@@ -111,6 +111,7 @@ def _servos(console: Console, config: str, text: str, *, whole: bool = True) -> 
     from projservo_cli.config.editing import named_plant
     from projservo_cli.hardware.so101 import SO101, connected, torque_reported
     from projservo_cli.records import InputError
+    from projservo_cli.words import line
 
     use, options = named_plant(text, config)
     if (name := plugins.short_name(use)) != "so101":
@@ -120,7 +121,7 @@ def _servos(console: Console, config: str, text: str, *, whole: bool = True) -> 
         try:
             yield servos
         finally:
-            console.say(torque_reported(servos)[0])
+            console.say(line(torque_reported(servos)[0]))
 
 
 def _entered(console: Console, what: str) -> Callable[[], bool]:

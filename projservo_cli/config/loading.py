@@ -28,7 +28,7 @@ from projservo_cli.files import bytes_of, text_of
 from projservo_cli.passwords import masked
 from projservo_cli.records import FloatArray, InputError
 from projservo_cli.settings.control import RENDERED, RenderedOptions
-from projservo_cli.settings.sections import CONTRADICTIONS, Finding, Root
+from projservo_cli.settings.sections import CONTRADICTIONS, Note, Root
 from projservo_cli.settings.task import CURRENT
 from projservo_cli.simulation.described import arm_of
 from projservo_cli.simulation.mjcf import read_mjcf
@@ -680,7 +680,7 @@ def _check_options(document: _Document) -> None:
             document.wrong(("plant", "options", *path), what)
 
 
-def _translated(model: type[BaseModel], errors: Sequence[ErrorDetails]) -> Iterator[Finding]:
+def _translated(model: type[BaseModel], errors: Sequence[ErrorDetails]) -> Iterator[Note]:
     """Return the findings of pydantic, in words; of a value that may be of several kinds one finding."""
     places = [
         tuple(part for part in error["loc"] if part != "[key]" and not _is_kind(part)) for error in errors

@@ -9,7 +9,7 @@ from pydantic import BeforeValidator, Field
 
 from projservo_cli.config.whole import FolderName
 from projservo_cli.settings.control import Plain, one_or_more
-from projservo_cli.settings.sections import Count, Finding, Number, Positive, Root, Section, Whole
+from projservo_cli.settings.sections import Count, Note, Number, Positive, Root, Section, Whole
 
 BASE, LAW = "base", "law"  # names of axes with a special meaning
 
@@ -23,7 +23,7 @@ class _Linked(Section):
         {}, description="further keys and their values for each of the values"
     )
 
-    def contradictions(self) -> Iterator[Finding]:
+    def contradictions(self) -> Iterator[Note]:
         """Keys that go with nothing."""
         for value in self.also.keys() - {*map(str, self.values)}:
             yield ("also", value), "is none of the values"
@@ -60,7 +60,7 @@ class Distribution(Section):
     )
     choice: tuple[Plain, ...] | None = Field(None, min_length=1, description="values of equal probability")
 
-    def contradictions(self) -> Iterator[Finding]:
+    def contradictions(self) -> Iterator[Note]:
         """None of the four or several, or bounds upside down."""
         given = [(name, value) for name, value in self if value is not None]
         if len(given) != 1:
@@ -90,7 +90,7 @@ class _Tasks(Section):
         """Number of tasks."""
         return len(self.listed) if self.listed is not None else self.random or 0
 
-    def contradictions(self) -> Iterator[Finding]:
+    def contradictions(self) -> Iterator[Note]:
         """Random and listed tasks, or none; rotations that are no range."""
         if (self.random is None) == (self.listed is None):
             yield (), "give exactly one of random and listed"
@@ -135,7 +135,7 @@ class SweepConfig(Root):
         None, description="number of runs made and stored together; null: about one second of work"
     )
 
-    def between(self, sound: Mapping[str, Any]) -> Iterator[Finding]:
+    def between(self, sound: Mapping[str, Any]) -> Iterator[Note]:
         """Names and values that stand twice, and axes without effect."""
         if len(names := {pathlib.Path(base).stem for base in self.base}) < len(self.base):
             yield ("base",), f"two files of one name, {', '.join(sorted(names))}: rename one"
@@ -148,7 +148,7 @@ class SweepConfig(Root):
                 yield ("grid", name), "a value stands there twice"
         yield from self._replaced()
 
-    def _replaced(self) -> Iterator[Finding]:
+    def _replaced(self) -> Iterator[Note]:
         """Yield axes over keys of task that the tasks take the place of."""
         if self.tasks is None:
             return

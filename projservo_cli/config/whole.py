@@ -20,7 +20,7 @@ from projservo_cli.settings.features import Feature, Name, misplaced
 from projservo_cli.settings.markers import Markers
 from projservo_cli.settings.objects import WORLD_AND_TOOL, Objects
 from projservo_cli.settings.robot import Rig, RobotSettings, like_degrees
-from projservo_cli.settings.sections import Finding, JointVector, Root, Whole
+from projservo_cli.settings.sections import JointVector, Note, Root, Whole
 from projservo_cli.settings.task import Goal, GoalImages, TaskSettings, TaskStep, Trajectory, sigma_key
 from projservo_cli.settings.trials import CalibrationSettings, Data, Noise
 from projservo_cli.simulation.described import described_truth
@@ -47,13 +47,13 @@ def _joint_types(robot: RobotSettings | None, data: Data | None) -> str:
 
 def _limits_in_joint_space(
     plant: PlantSettings, trajectory: Trajectory, robot: RobotSettings | None
-) -> Iterator[Finding]:
+) -> Iterator[Note]:
     bounded = robot is not None and (robot.limits is not None or np.isfinite(robot.ranges).all())
     if trajectory.profile == "joint_space" and not plant.simulated and not bounded:
         yield ("robot",), f"the profile joint_space needs the limits of all joints: {LIMITS_MISSING}"
 
 
-def _same_joints(robot: RobotSettings | None, data: Data | None) -> Iterator[Finding]:
+def _same_joints(robot: RobotSettings | None, data: Data | None) -> Iterator[Note]:
     given = _joint_types(robot, data)
     if robot is not None and robot.joints and given != robot.joint_types:
         yield ("data", "joints"), f"{given} are not the joints of the robot, {robot.joint_types}"
@@ -64,7 +64,7 @@ def _joint_vectors(
     data: Data | None,
     calibration: CalibrationSettings,
     task: TaskSettings | None,
-) -> Iterator[Finding]:
+) -> Iterator[Note]:
     """Vectors that are not of the robot's joints, and poses beyond their limits."""
     types = _joint_types(robot, data)
     vectors: dict[tuple[str, ...], JointVector | None] = {("calibration", "reference"): calibration.reference}
@@ -89,7 +89,7 @@ def _joint_vectors(
                 yield from _beyond_limits(robot, vector, *place)
 
 
-def _beyond_limits(robot: RobotSettings, vector: JointVector, *path: str) -> Iterator[Finding]:
+def _beyond_limits(robot: RobotSettings, vector: JointVector, *path: str) -> Iterator[Note]:
     values = vector.values(robot.joint_types).tolist() if len(vector.joints) == len(robot.joints) else ()
     for i, (value, joint) in enumerate(zip(values, robot.joints, strict=False)):
         low, high = joint.limits
@@ -101,7 +101,7 @@ def _beyond_limits(robot: RobotSettings, vector: JointVector, *path: str) -> Ite
 
 def _goal_images(
     task: TaskSettings | None, markers: Markers | None, trajectory: Trajectory
-) -> Iterator[Finding]:
+) -> Iterator[Note]:
     for path, goal in ({} if task is None else task.each_goal).items():
         if goal.images is not None:
             yield from _images_of(("task", *path, "images"), goal.images, markers, trajectory)
@@ -109,7 +109,7 @@ def _goal_images(
 
 def _images_of(
     path: tuple[str, ...], images: GoalImages, markers: Markers | None, trajectory: Trajectory
-) -> Iterator[Finding]:
+) -> Iterator[Note]:
     if markers is None or markers.front is None:
         yield path, "needs markers.face, whose markers these pixels are"
         return
@@ -134,7 +134,7 @@ def _images_of(
 
 def _incidences(
     features: Mapping[str, Feature], task: TaskSettings | None, markers: Markers | None, control: Control
-) -> Iterator[Finding]:
+) -> Iterator[Note]:
     for name, feature in features.items():
         source = None if any(feature.contradictions()) else feature.source
         if isinstance(source, tuple) and markers is not None:
@@ -162,7 +162,7 @@ def _incidences(
 
 def _objects(
     objects: Objects, markers: Markers | None, rig: Rig | None, data: Data | None, plant: PlantSettings
-) -> Iterator[Finding]:
+) -> Iterator[Note]:
     """Objects before cameras on the tool, with markers of the tool, or nowhere in a simulation."""
     if objects.named and TOOL in (rig and rig.mount, data and data.mount):
         yield ("objects",), "cameras on the tool see the scene that the goal is on: its images carry the goal"
@@ -188,7 +188,7 @@ def name_of_carrier(goal: Goal, features: Mapping[str, Feature]) -> str | None:
 
 def _carried(
     objects: Objects, features: Mapping[str, Feature], task: TaskSettings | None, plant: PlantSettings
-) -> Iterator[Finding]:
+) -> Iterator[Note]:
     """Objects that are none, a goal that would be torn, and one of which nobody saw the object."""
     known = f"objects: {', '.join(objects.named) or 'none'}"
     for name, feature in features.items():
@@ -210,7 +210,7 @@ def _carried_by(
     goal: Goal,
     features: Mapping[str, Feature],
     plant: PlantSettings,
-) -> Iterator[Finding]:
+) -> Iterator[Note]:
     """Features that the object of a goal at a path does not carry, and images that do not show it."""
     for i, pair in enumerate(goal.incidences):
         if pair[1] in features and (on := features[pair[1]].on) != carrier:
@@ -226,12 +226,12 @@ def _carried_by(
         yield (*path, "objects", carrier), f"has markers that are not of {carrier}: teach it again"
 
 
-def _simulated_alone(disturbance: Disturbance, plant: PlantSettings) -> Iterator[Finding]:
+def _simulated_alone(disturbance: Disturbance, plant: PlantSettings) -> Iterator[Note]:
     if not plant.simulated and disturbance != Disturbance():
         yield ("disturbance",), "disturbs the simulated robot; leave it out where plant.use names another"
 
 
-def _force(plant: PlantSettings, stop: Stop) -> Iterator[Finding]:
+def _force(plant: PlantSettings, stop: Stop) -> Iterator[Note]:
     if plant.use is None and stop.max_force_n is not None:
         yield (
             ("stop", "max_force_n"),
@@ -239,9 +239,7 @@ def _force(plant: PlantSettings, stop: Stop) -> Iterator[Finding]:
         )
 
 
-def _rendered(
-    plant: PlantSettings, noise: Noise, markers: Markers | None, rig: Rig | None
-) -> Iterator[Finding]:
+def _rendered(plant: PlantSettings, noise: Noise, markers: Markers | None, rig: Rig | None) -> Iterator[Note]:
     """Yield keys without effect for rendered images."""
     if plant.use != RENDERED:
         return
@@ -257,13 +255,13 @@ def _rendered(
         yield ("markers",), "plant mujoco shows tags: set markers.tags, such as roof"
 
 
-def _dictionary(plant: PlantSettings, markers: Markers | None) -> Iterator[Finding]:
+def _dictionary(plant: PlantSettings, markers: Markers | None) -> Iterator[Note]:
     """Yield a dictionary of tags that is given twice."""
     if markers is not None and markers.dictionary is not None and "dictionary" in plant.options:
         yield ("markers", "dictionary"), "plant.options gives the class its dictionary as well; keep one"
 
 
-def _cameras(plant: PlantSettings, markers: Markers | None, cameras: Cameras | None) -> Iterator[Finding]:
+def _cameras(plant: PlantSettings, markers: Markers | None, cameras: Cameras | None) -> Iterator[Note]:
     """Cameras of nobody, or with nothing to find."""
     if cameras is None:
         return
@@ -279,19 +277,19 @@ def _cameras(plant: PlantSettings, markers: Markers | None, cameras: Cameras | N
         )
 
 
-def _same_mount(rig: Rig | None, data: Data | None) -> Iterator[Finding]:
+def _same_mount(rig: Rig | None, data: Data | None) -> Iterator[Note]:
     """Yield a mount that rig and table state otherwise."""
     if rig is not None and data is not None and data.mount not in (None, rig.mount):
         yield ("data", "mount"), f"is {data.mount} where rig.mount is {rig.mount}: keep one"
 
 
-def _moving_images(rig: Rig | None, trajectory: Trajectory) -> Iterator[Finding]:
+def _moving_images(rig: Rig | None, trajectory: Trajectory) -> Iterator[Note]:
     """Yield regions of images that move with the tool."""
     if rig is not None and rig.mount == TOOL and trajectory.keep_out:
         yield ("trajectory", "keep_out"), "are regions of images that stand still; cameras on the tool move"
 
 
-def _disturbed_joints(disturbance: Disturbance, robot: RobotSettings | None) -> Iterator[Finding]:
+def _disturbed_joints(disturbance: Disturbance, robot: RobotSettings | None) -> Iterator[Note]:
     if robot is None or not robot.joints:
         return
     types, moved = robot.joint_types, disturbance.joint_moved
@@ -305,7 +303,7 @@ def _disturbed_joints(disturbance: Disturbance, robot: RobotSettings | None) -> 
             yield ("disturbance", "joint_moved"), f"joint {moved.joint} is of type {letter}: give {fitting}"
 
 
-def _disturbed_markers(disturbance: Disturbance, markers: Markers | None) -> Iterator[Finding]:
+def _disturbed_markers(disturbance: Disturbance, markers: Markers | None) -> Iterator[Note]:
     lost, moved = disturbance.lost_markers, disturbance.marker_moved
     if lost is not None and lost.markers is not None and markers is not None:
         yield from markers.unknown(lost.markers, "disturbance", "lost_markers", "markers")
@@ -314,7 +312,7 @@ def _disturbed_markers(disturbance: Disturbance, markers: Markers | None) -> Ite
             yield ("disturbance", "marker_moved", "marker"), what
 
 
-def _disturbed_objects(disturbance: Disturbance, objects: Objects, plant: PlantSettings) -> Iterator[Finding]:
+def _disturbed_objects(disturbance: Disturbance, objects: Objects, plant: PlantSettings) -> Iterator[Note]:
     moved = disturbance.object_moved
     if moved is None:
         return
@@ -327,7 +325,7 @@ def _disturbed_objects(disturbance: Disturbance, objects: Objects, plant: PlantS
         yield ("disturbance", "object_moved"), "moves no object before rendered cameras; leave plant.use out"
 
 
-def _plan_to_follow(control: Control, trajectory: Trajectory) -> Iterator[Finding]:
+def _plan_to_follow(control: Control, trajectory: Trajectory) -> Iterator[Note]:
     limits = (control.joint_speed_limit_deg_s, control.prismatic_speed_limit_m_s)
     if any(mode != REGULATE for mode in control.mode) and {*limits, trajectory.duration_s} == {None}:
         yield (
@@ -337,7 +335,7 @@ def _plan_to_follow(control: Control, trajectory: Trajectory) -> Iterator[Findin
         )
 
 
-def _keeping_out(control: Control, trajectory: Trajectory) -> Iterator[Finding]:
+def _keeping_out(control: Control, trajectory: Trajectory) -> Iterator[Note]:
     if trajectory.keep_out and REGULATE in control.mode:
         yield (
             ("control", "mode"),
@@ -348,14 +346,14 @@ def _keeping_out(control: Control, trajectory: Trajectory) -> Iterator[Finding]:
 
 def _speed_in_joint_space(
     control: Control, trajectory: Trajectory, robot: RobotSettings | None, data: Data | None
-) -> Iterator[Finding]:
+) -> Iterator[Note]:
     types = _joint_types(robot, data)
     for letter, key in (("R", "joint_speed_limit_deg_s"), ("P", "prismatic_speed_limit_m_s")):
         if trajectory.profile == "joint_space" and letter in types and getattr(control, key) is None:
             yield ("control", key), "the profile joint_space goes as fast as joints can: give their limit"
 
 
-_RULES: dict[Callable[..., Iterator[Finding]], set[str]] = {  # with the sections that each takes
+_RULES: dict[Callable[..., Iterator[Note]], set[str]] = {  # with the sections that each takes
     rule: {*inspect.signature(rule).parameters}
     for rule in (
         *(
@@ -385,7 +383,7 @@ _RULES: dict[Callable[..., Iterator[Finding]], set[str]] = {  # with the section
 }
 
 
-def _missing(sections: Mapping[str, Any]) -> Iterator[Finding]:
+def _missing(sections: Mapping[str, Any]) -> Iterator[Note]:
     """Yield the missing parts of a simulated run."""
     reason = "is missing; a simulated run needs it"
     for key in ("robot", "rig"):
@@ -423,7 +421,7 @@ class Settings(Printed, Root):
     stop: Stop = Stop()
     report: ReportSettings = ReportSettings()
 
-    def between(self, sound: Mapping[str, Any]) -> Iterator[Finding]:
+    def between(self, sound: Mapping[str, Any]) -> Iterator[Note]:
         """Yield the missing parts of a simulated run, and contradictions between sections."""
         if sound.get("data", "broken") is None:
             yield from _missing(sound)

@@ -3,13 +3,15 @@
 import math
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from projservo_cli import words
 from projservo_cli.detection import Corners, Finder
+from projservo_cli.findings import LIMITS, REFUSES, Finding, Subject
 from projservo_cli.hardware.video_cameras import Frame, VideoCamera
 from projservo_cli.records import ByteArray, FloatArray, WorkFailed
 from projservo_cli.settings.cameras import Cameras
@@ -142,11 +144,9 @@ class CameraRobot:
         """Raise WorkFailed for an image (height, width) without tags whose mirror image shows them."""
         tags = self.finder.find(grey[:, ::-1].astype(np.float64))[0].keys()
         if mirrored := tags & {*(self._numbers // self.finder.corners).tolist()}:
-            tags_shown = f"tag{'s' * (len(mirrored) > 1)} {', '.join(map(str, sorted(mirrored)))}"
-            raise WorkFailed(
-                f"the {self.view[view]} camera's image is mirrored: it shows no tag, its mirror image "
-                f"{tags_shown}; switch off mirror or flip of the {self.view[view]} camera"
-            )
+            corners = tuple(self.finder.corners * number for number in sorted(mirrored))
+            where = Subject(views=(self.view[view],), markers=corners)
+            raise words.failed([Finding("mirrored_image", REFUSES, where)])
 
     def _corners(self, view: View | None) -> tuple[FloatArray, FloatArray]:
         """Pixels (m, 2) of all markers and their deviations (m,); NaN where unseen, rejected or lost."""
@@ -187,14 +187,10 @@ class CameraRobot:
         for camera in self.cameras:
             camera.end()
 
-    def remarks(self) -> list[str]:
-        """Return the faults of the last frames, in words: dark, clipped or blurred ones."""
+    def remarks(self) -> list[Finding]:
+        """Return the faults of the last frames: dark, clipped or blurred ones."""
         visible = [(name, view) for name, view in zip(self.view, self.views, strict=True) if view is not None]
-        return [
-            f"the {name} image {what}"
-            for name, view in visible
-            for what in exposure_of(view.frame.grey).faults()
-        ]
+        return [one for name, view in visible for one in exposure_of(view.frame.grey).faults(name)]
 
 
 class _Exposure(NamedTuple):
@@ -205,18 +201,17 @@ class _Exposure(NamedTuple):
     clipped: float  # share of pixels that are white
     blur_px: float  # standard deviation of the blur of its sharpest edges; NaN where it has none
 
-    def faults(self) -> list[str]:
-        """Return what is wrong with the frame, each with its remedy; empty for a sound one."""
-        wrong = []
+    def faults(self, view: str) -> Iterator[Finding]:
+        """Yield what is wrong with the frame of a view; nothing for a sound one."""
+        where = Subject(views=(view,))
         if self.brightest < _DARK:
-            wrong.append("is black: take the cap off, or look whether its shutter is closed")
+            yield Finding("black_image", REFUSES, where, self.brightest, limit=_DARK)
         elif self.mean < _DARK:
-            wrong.append(f"is dark (grey {self.mean:.0f} of 255 on average): add light, or raise exposure_ms")
+            yield Finding("dark_image", LIMITS, where, self.mean, limit=_DARK)
         if self.clipped > _CLIPPED_SHARE:
-            wrong.append(f"is saturated: {self.clipped:.0%} of it is white: lower exposure_ms, or the light")
+            yield Finding("saturated_image", LIMITS, where, self.clipped, limit=_CLIPPED_SHARE, unit="1")
         if self.blur_px > _BLURRED:
-            wrong.append(f"is blurred by {self.blur_px:.1f} px ({_BLURRED:g} at most): focus it on the tags")
-        return wrong
+            yield Finding("blurred_image", LIMITS, where, self.blur_px, limit=_BLURRED, unit="px")
 
 
 def exposure_of(grey: ByteArray) -> _Exposure:

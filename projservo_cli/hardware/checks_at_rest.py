@@ -1,40 +1,32 @@
-"""Checks of robot and cameras before anything is recorded, and findings with their remedies."""
+"""Checks of robot and cameras before anything is recorded."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import combinations, product
-from typing import NamedTuple
 
 import numpy as np
 
 from projservo_cli.detection import MIN_CELL, BoardFinder, Corners, Finder, TagFinder, dictionaries
+from projservo_cli.findings import LIMITS, NOTE, REFUSES, Finding, Subject
 from projservo_cli.hardware.camera_robot import View, exposure_of
 from projservo_cli.hardware.video_cameras import VideoCamera, stable_name
-from projservo_cli.records import CORNERS, BoolArray, ByteArray, FloatArray, JointLimits, in_unit
+from projservo_cli.records import CORNERS, BoolArray, ByteArray, FloatArray, JointLimits
 
-FAULT, WARNING, FINE = "fault", "warning", "fine"
 # Width of a cell, px, from which corners are good.
 _GOOD_CELL = 4.0
 # Frames a second, as a share of those asked for, below which a camera is slow; those of webcams by day, 1/s.
 _SLOW, _USUAL_HZ = 0.75, 30.0
-# Angle between the directions from which two cameras see a tag, deg: depth errors grow with its inverse.
-_MIN_ANGLE_DEG, _GOOD_ANGLE_DEG = 4.0, 10.0
+# Angle between the directions from which two cameras see a tag, rad: depth errors grow with its inverse.
+_MIN_ANGLE, _GOOD_ANGLE = math.radians(4.0), math.radians(10.0)
+# Scatter of corners at rest, in stated deviations and in px, from which something flickers or shakes.
+_FLICKER, _FLICKER_PX = 5.0, 0.3
 # Standard deviations of a corner by which perspective must move it to show the side of a tilt.
 _CERTAIN = 4.0
 # Markers that two cameras, or the only one, must see: a turn about a line through two shows in no image.
 MIN_SHARED = 3
 # Distance from a limit at which a joint has no room, rad.
 _ROOM = math.radians(1.0)
-
-
-class Finding(NamedTuple):
-    """One result of a check."""
-
-    level: str  # fault, warning or fine
-    where: str  # subject
-    text: str  # finding, with the number and its limit
-    remedy: str = ""  # empty for a sound part
 
 
 @dataclass(eq=False)
@@ -48,7 +40,7 @@ class RobotAtRest:
     sigma: FloatArray | None  # (V, m) deviation of a corner of one frame as the detector states it, px
     scatter: FloatArray  # (V, m) between frames, px
     limits: JointLimits
-    units: Sequence[str]  # of the joints, for messages
+    units: Sequence[str]  # of the joints: deg, rad or m
     views: Sequence[View] = ()  # the last one of each camera of projservo
     cameras: Sequence[VideoCamera] = ()
     health: Mapping[str, float | str] = field(default_factory=dict)  # such as the voltage
@@ -68,88 +60,72 @@ def findings_at_rest(
         elif isinstance(finder, BoardFinder):
             yield _of_board(camera.name, view, finder)
     yield from _of_all_views(robot)
-    yield from _of_joints(robot, FAULT if moves else WARNING)
+    yield from _of_joints(robot, REFUSES if moves else LIMITS)
 
 
 def _of_camera(camera: VideoCamera) -> Iterator[Finding]:
     """Rate, stamps, exposure and sharpness of a camera."""
-    where, grey = f"{camera.name} camera", camera.newest().grey
+    where, grey = Subject(views=(camera.name,)), camera.newest().grey
     rate, asked = camera.rate_hz, camera.settings.rate_hz or _USUAL_HZ
-    stamps = "stamped by its driver" if camera.stamped else "stamped when they arrive"
-    size = f"{grey.shape[1]} x {grey.shape[0]} px"
-    frames = f"{rate:.1f}" if math.isfinite(rate) else "fewer than 3"
-    if not rate >= _SLOW * asked:
-        remedy = (
-            "webcams expose longer in the dark: add light, or set exposure_ms below "
-            f"{1e3 / asked:.0f}; on one hub with another camera, set fourcc: MJPG"
-        )
-        yield Finding(WARNING, where, f"{size}, {frames} frames a second instead of {asked:g}", remedy)
+    stamped = replace(where, name="by its driver" if camera.stamped else "")
+    size = Finding("size", amount=grey.shape[1], limit=grey.shape[0], unit="px")
+    if rate >= _SLOW * asked:
+        yield Finding("camera_rate", NOTE, stamped, rate, limit=asked, unit="1/s", others=(size,))
     else:
-        yield Finding(FINE, where, f"{size}, {frames} frames a second, {stamps}")
-    for remark in camera.remarks:
-        what, _, remedy = remark.partition(": ")
-        yield Finding(WARNING, where, what, remedy or "take another camera, or keep it from changing")
+        yield Finding("slow_camera", LIMITS, where, rate, limit=asked, unit="1/s", others=(size,))
+    yield from camera.remarks
     if name := stable_name(camera.settings.source):
-        what = f"device {camera.settings.source} may get another number when it is plugged in again"
-        yield Finding(WARNING, where, what, f"set cameras.{camera.name}.source: {name}")
+        yield Finding("unstable_device", LIMITS, replace(where, name=name))
     light = exposure_of(grey)
-    for wrong in light.faults():
-        what, _, remedy = wrong.rpartition(": ")
-        yield Finding(FAULT if "black" in wrong else WARNING, where, f"its image {what}", remedy)
-    text = f"mean grey {light.mean:.0f} of 255, {light.clipped:.1%} white"
-    sharp = math.isfinite(light.blur_px)
-    yield Finding(FINE, where, f"{text}, edges blurred by {light.blur_px:.1f} px" if sharp else text)
+    yield from light.faults(camera.name)
+    white = Finding("white", amount=light.clipped, unit="1")
+    blur = (Finding("blur", amount=light.blur_px, unit="px"),) * math.isfinite(light.blur_px)
+    yield Finding("exposure", NOTE, where, light.mean, unit="1", others=(white, *blur))
 
 
 def _of_tags(
     name: str, view: View, robot: RobotAtRest, finder: TagFinder, dictionary: str
 ) -> Iterator[Finding]:
     """Tags in the image of a camera: which, how large, how certain."""
-    where, expected = f"{name} image", {number // CORNERS for number in robot.marker}
+    where, expected = Subject(views=(name,)), {number // CORNERS for number in robot.marker}
     for number in view.repeated:
-        remedy = "a number must be unique: print another one, or cover the tag that is not on the tool"
-        yield Finding(FAULT, where, f"tag {number} is there twice", remedy)
+        yield Finding("repeated_tag", REFUSES, replace(where, tag=number))
     there = {number: tag for number, tag in view.tags.items() if number in expected}
     if not there:
         other, count = _other_dictionary(view.frame.grey, dictionary)
+        own = Finding("dictionary", subject=Subject(name=dictionary))
         if count > len(view.tags):
-            remedy = f"set markers.dictionary: {other}, or print tags of {dictionary}"
-            yield Finding(FAULT, where, f"{count} tags are of {other}, none of {dictionary}", remedy)
+            yield Finding("other_dictionary", REFUSES, replace(where, name=other), count, others=(own,))
         elif view.tags:
-            others = ", ".join(map(str, sorted(view.tags)))
-            remedy = "name the corners of the tags on the tool (4 t + k) in markers.numbers"
-            yield Finding(FAULT, where, f"tags {others} are there, and markers has none of them", remedy)
+            corners = tuple(CORNERS * number for number in sorted(view.tags))
+            yield Finding("unknown_tags", REFUSES, replace(where, markers=corners))
         else:
-            minimum = math.ceil(MIN_CELL * finder.cells)
-            remedy = (
-                f"turn the tool towards it; look at light, focus and white margins; tags below {minimum} px "
-            )
-            remedy += f"({MIN_CELL:g} px a cell) are too small: print larger ones, or move the camera nearer"
-            yield Finding(FAULT, where, f"there is no tag of {dictionary}", remedy)
+            subject, minimum = replace(where, name=dictionary), math.ceil(MIN_CELL * finder.cells)
+            yield Finding("no_tag", REFUSES, subject, MIN_CELL, limit=minimum, unit="px")
         return
     width = {number: _width(tag) for number, tag in there.items()}
     smallest = min(width, key=lambda number: width[number])
     cell = width[smallest] / finder.cells
     sigma = np.concatenate([tag.sigma[np.isfinite(tag.sigma)] for tag in there.values()])
-    sizes = ", ".join(f"{number} ({width[number]:.0f} px)" for number in sorted(there))
-    text = f"tags {sizes}" + (f"; corners to {np.median(sigma):.2g} px" if sigma.size else "")
+    widths = {n: Finding("width", subject=Subject(tag=n), amount=width[n], unit="px") for n in sorted(there)}
     if cell < _GOOD_CELL:
         limit = MIN_CELL if cell < MIN_CELL else _GOOD_CELL
-        level = FAULT if max(width.values()) / finder.cells < MIN_CELL else WARNING
-        what = f"tag {smallest} is {width[smallest]:.0f} px wide, {cell:.1f} px a cell ({limit:g} at least)"
-        yield Finding(level, where, what, "print larger tags, move the camera nearer, or raise its size_px")
-    yield Finding(FINE, where, text)
+        level = REFUSES if max(width.values()) / finder.cells < MIN_CELL else LIMITS
+        subject, part = replace(where, tag=smallest), widths[smallest]
+        yield Finding("small_tag", level, subject, cell, limit=limit, unit="px", others=(part,))
+    certain = float(np.median(sigma)) if sigma.size else math.nan
+    yield Finding("tags_seen", NOTE, where, certain, unit="px", others=(*widths.values(),))
 
 
 def _of_board(name: str, view: View, finder: BoardFinder) -> Finding:
     """The board in the image of a camera: how many of its corners, how certain."""
+    where = Subject(views=(name,), name=str(finder.board))
     if not view.tags:
-        what, _, remedy = finder.nothing.format(count=1).partition(": ")
-        return Finding(FAULT, f"{name} image", f"there is {what.replace('any of 1 images', 'it')}", remedy)
+        return Finding("no_board", REFUSES, where)
     sigma = view.tags[0].sigma
     known = sigma[np.isfinite(sigma)]
-    text = f"{finder.board} with {known.size} of {finder.corners} corners, to {np.median(known):.2g} px"
-    return Finding(FINE, f"{name} image", text)
+    count = Finding("corners", amount=known.size, limit=finder.corners, unit="1")
+    return Finding("board_seen", NOTE, where, float(np.median(known)), unit="px", others=(count,))
 
 
 def _width(tag: Corners) -> float:
@@ -177,54 +153,35 @@ def _of_all_views(robot: RobotAtRest) -> Iterator[Finding]:
     Of a single camera those that it sees.
     """
     visible = np.isfinite(robot.s[..., 0])
-    images, cameras, share, lack = {
-        1: ("image", "the camera", "shows", "does not show"),
-        2: ("both images", "both cameras", "share", "do not both show"),
-    }.get(len(visible), ("images", "the cameras", "two or more show", "fewer than two show"))
     in_two: BoolArray = visible.sum(axis=0) >= min(2, len(visible))
-    shared = int(in_two.sum())
+    shared, total = int(in_two.sum()), len(robot.marker)
+    least = Finding("share", amount=MIN_SHARED, unit="1")
     if visible.any(axis=1).all() and shared < MIN_SHARED:
-        remedy = f"turn the tool towards {cameras}, or move {'it' if len(visible) == 1 else 'them'}"
-        what = f"{share} {shared} of {len(robot.marker)} markers ({MIN_SHARED} at least)"
-        yield Finding(FAULT, images, what, remedy)
+        yield Finding("few_shared", REFUSES, amount=shared, limit=total, unit="1", others=(least,))
     elif shared:
-        yield Finding(FINE, images, f"{share} {shared} of {len(robot.marker)} markers")
+        yield Finding("shared_markers", NOTE, amount=shared, limit=total, unit="1")
     shared_numbers = {number for k, number in enumerate(robot.marker) if in_two[k]}
     for number in robot.marker:
         if shared and number in robot.face and number not in shared_numbers:
-            what = f"{lack} marker {number} of the face, tag {number // CORNERS}"
-            remedy = f"turn the tool towards {cameras}, or name another markers.face"
-            yield Finding(WARNING, images, what, remedy)
+            yield Finding("unshared_face", LIMITS, Subject(markers=(number,)))
             break
     if len(robot.views) > 1:
-        angles = [_view_angle_deg(one.tags, other.tags) for one, other in combinations(robot.views, 2)]
+        angles = [_view_angle(one.tags, other.tags) for one, other in combinations(robot.views, 2)]
         angle = max(angles, key=lambda one: -math.inf if math.isnan(one) else one)
-        if angle < _GOOD_ANGLE_DEG:
-            what = (
-                f"the cameras see the tags from directions {angle:.1f}° apart ({_GOOD_ANGLE_DEG:g}° at least)"
-            )
-            remedy = (
-                "move them apart, by a third of their distance from the tool: depth shows in their difference"
-            )
-            yield Finding(FAULT if angle < _MIN_ANGLE_DEG else WARNING, cameras, what, remedy)
+        if angle < _GOOD_ANGLE:
+            level = REFUSES if angle < _MIN_ANGLE else LIMITS
+            yield Finding("alike_views", level, amount=angle, limit=_GOOD_ANGLE, unit="rad")
         elif np.isfinite(angle):
-            yield Finding(FINE, cameras, f"see the tags from directions {angle:.0f}° apart")
-    noise, stated = np.nanmedian(robot.scatter) if np.isfinite(robot.scatter).any() else 0.0, robot.sigma
-    if (
-        stated is not None
-        and np.isfinite(stated).any()
-        and noise > 5.0 * np.nanmedian(stated)
-        and noise > 0.3
-    ):
-        what = (
-            f"corners scatter by {noise:.2g} px at rest, {noise / np.nanmedian(stated):.0f} times their noise"
-        )
-        remedy = "look for lamps that flicker, tables that shake, and autofocus"
-        yield Finding(WARNING, images, what, remedy)
+            yield Finding("directions", NOTE, amount=angle, limit=_GOOD_ANGLE, unit="rad")
+    noise = float(np.nanmedian(robot.scatter)) if np.isfinite(robot.scatter).any() else 0.0
+    known = robot.sigma is not None and np.isfinite(robot.sigma).any()
+    stated = float(np.nanmedian(robot.sigma)) if robot.sigma is not None and known else math.inf
+    if noise > _FLICKER * stated and noise > _FLICKER_PX:
+        yield Finding("flicker", LIMITS, amount=noise, limit=stated, unit="px")
 
 
-def _view_angle_deg(left: Mapping[int, Corners], right: Mapping[int, Corners]) -> float:
-    """Angle between the directions from which two cameras see the tags, median over tags; NaN without one.
+def _view_angle(left: Mapping[int, Corners], right: Mapping[int, Corners]) -> float:
+    """Angle between the directions from which cameras see tags, rad, median over tags; NaN without one.
 
     Tags whose perspective does not show to which side they are tilted count where there are no others; of the
     sides that fit them the nearer ones are taken.
@@ -237,7 +194,7 @@ def _view_angle_deg(left: Mapping[int, Corners], right: Mapping[int, Corners]) -
         towards = [_directions(view[number].pixels, view[number].sigma) for view in (left, right)]
         cosine = max(float(np.clip(a @ b, -1.0, 1.0)) for a, b in product(*towards))
         certain = len(towards[0]) == len(towards[1]) == 1
-        (sure if certain else unsure).append(math.degrees(math.acos(cosine)))
+        (sure if certain else unsure).append(math.acos(cosine))
     return float(np.median(sure or unsure)) if sure or unsure else math.nan
 
 
@@ -267,23 +224,24 @@ def _directions(pixels: FloatArray, sigma: FloatArray) -> list[FloatArray]:
 def _of_joints(robot: RobotAtRest, endless: str) -> Iterator[Finding]:
     """Readings within their limits, and the measurements of the arm itself.
 
-    endless : level of a joint without limits.
+    endless : severity of a joint without limits.
     """
     lower, upper = robot.limits.lower, robot.limits.upper
-    readings = ", ".join(in_unit(x, unit, 4) for x, unit in zip(robot.q.tolist(), robot.units, strict=True))
-    yield Finding(FINE, "joints", f"read {readings}")
-    for i, (x, unit) in enumerate(zip(robot.q.tolist(), robot.units, strict=True)):
-        low, high = (in_unit(float(limit[i]), unit, 4) for limit in (lower, upper))
-        if not np.isfinite([lower[i], upper[i]]).all():
-            yield Finding(
-                endless, f"joint {i + 1}", "has no limits", "set robot.limits.joints, or run projservo limits"
-            )
-        elif not lower[i] <= x <= upper[i]:
-            what = f"reads {in_unit(x, unit, 4)}, beyond its limits {low} to {high}"
-            remedy = "move it back by hand; a reading far off has another unit or zero than the limits"
-            yield Finding(FAULT, f"joint {i + 1}", what, remedy)
-        elif unit != "m" and min(x - lower[i], upper[i] - x) < _ROOM:
-            what = f"reads {in_unit(x, unit, 4)}, at its limits {low} to {high}"
-            yield Finding(WARNING, f"joint {i + 1}", what, "move it away from there by hand")
+    units = ["m" if unit == "m" else "rad" for unit in robot.units]
+    joints = [
+        Finding("reading", subject=Subject(joints=(i,)), amount=x, unit=unit)
+        for i, (x, unit) in enumerate(zip(robot.q.tolist(), units, strict=True), 1)
+    ]
+    yield Finding("joint_readings", NOTE, others=(*joints,))
+    for one, low, high in zip(joints, lower.tolist(), upper.tolist(), strict=True):
+        limits = (Finding("range", amount=low, limit=high, unit=one.unit),)
+        if not np.isfinite([low, high]).all():
+            yield Finding("joint_without_limits", endless, one.subject)
+        elif not low <= one.amount <= high:
+            yield replace(one, code="joint_beyond_limits", severity=REFUSES, others=limits)
+        elif one.unit != "m" and min(one.amount - low, high - one.amount) < _ROOM:
+            yield replace(one, code="joint_at_limit", severity=LIMITS, others=limits)
     for name, value in robot.health.items():
-        yield Finding(FINE, "arm", f"{name} {value:.4g}" if isinstance(value, float) else f"{name} {value}")
+        amount = value if isinstance(value, float) else math.nan
+        told = f"{value:.4g}" if isinstance(value, float) else value
+        yield Finding("health", NOTE, Subject(name=f"{name} {told}"), amount)

@@ -8,10 +8,11 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 
 from projservo_cli.calibration.detections import per_rad
-from projservo_cli.hardware.checks_at_rest import FAULT, FINE, WARNING, Finding
-from projservo_cli.records import CORNERS, TOOL, VIEWS, WORLD, BoolArray, FloatArray, IntArray
+from projservo_cli.findings import LIMITS, NOTE, REFUSES, Finding, Subject
+from projservo_cli.records import CORNERS, VIEWS, BoolArray, FloatArray, IntArray
 from projservo_cli.robots.contract import Reading
 from projservo_cli.robots.pacing import Steered
+from projservo_cli.words.values import quantity
 
 # Angles are of revolute joints. Prismatic ones go the lengths that make as much of a difference to images.
 # How far a joint goes to each side, and how fast: quick strokes show the latency, slow ones the hysteresis.
@@ -47,7 +48,7 @@ class Strokes(NamedTuple):
     end: IntArray  # (k,) number of the stroke of each reading
     target: FloatArray  # (k,) rad, as is q
     readings: tuple[Reading, ...]
-    given_up: str  # why it was broken off; empty where it was not
+    given_up: Finding | None = None  # why it was broken off
 
     @property
     def q(self) -> FloatArray:
@@ -66,15 +67,14 @@ def _unit(slides: bool) -> float:
     return float(per_rad(np.array(slides)))
 
 
-def _text(angle: float, slides: bool) -> str:
-    """Write an angle, rad, in degrees, or the length that it stands for in mm, to a tenth."""
-    value = 1e3 * angle * _unit(slides) if slides else math.degrees(angle)
-    return f"{round(value, 1):g}{' mm' if slides else '°'}"
+def _name(slides: bool) -> str:
+    """Unit of a joint."""
+    return "m" if slides else "rad"
 
 
 def reach_of(types: str) -> str:
     """Return how far joints of these types, R or P each, go to either side, in words."""
-    turns, slides = _text(_REACH, False), _text(_REACH, True)
+    turns, slides = quantity(_REACH, "rad"), quantity(_REACH * _unit(True), "m")
     if "P" not in types:
         return turns
     return f"{turns}, prismatic ones by {slides}," if "R" in types else slides
@@ -86,8 +86,8 @@ _STROKES = (*((1, True), (-1, True)) * 3, (0, False), (1, False), (0, False))
 _UP, _DOWN, _FROM_BELOW, _FROM_ABOVE = 4, 5, 6, 8
 
 
-def strokes(steered: Steered, joint: int) -> Strokes | str:
-    """Move a joint to and fro about where it stands; words where it has no room for that.
+def strokes(steered: Steered, joint: int) -> Strokes | Finding:
+    """Move a joint to and fro about where it stands; a finding where it has no room for that.
 
     steered : the robot, one for all joints: each set-point that begins at a reading lets an arm sag further.
     """
@@ -96,11 +96,11 @@ def strokes(steered: Steered, joint: int) -> Strokes | str:
     for _ in range(math.ceil(_PAUSE_S / bounds.period)):
         steered.hold()
     slides = [*bounds.units][joint : joint + 1] == ["m"]
-    unit = _unit(slides)
+    unit, subject = _unit(slides), Subject(joints=(joint + 1,))
     low = max(-_REACH * unit, bounds.limits.lower[joint] + _KEPT * unit - q[joint])
     high = min(_REACH * unit, bounds.limits.upper[joint] - _KEPT * unit - q[joint])
     if high - low < _LEAST_WAY * unit or not low < 0.0 < high:
-        return f"it has no room for {_text(_LEAST_WAY, slides)}: move it away from its limit by hand"
+        return Finding("joint_without_room", LIMITS, subject, _LEAST_WAY * unit, unit=_name(slides))
     middle = float(steered.target[joint])
     rows: list[tuple[int, float, Reading]] = []
     for number, (end, quick) in enumerate(_STROKES):
@@ -117,9 +117,9 @@ def strokes(steered: Steered, joint: int) -> Strokes | str:
             rows.append((number, float(steered.target[joint]) / unit, steered.observe()))
         way, gone = abs(goal - begun), abs(float(steered.reading.q[joint]) - from_q)
         if number in _HELD and gone < _HELD[number] * way:
-            what = f"went {bounds.text(joint, gone, 2)} of {bounds.text(joint, way, 2)}"
-            return Strokes(joint, slides, *_columns(rows), what)
-    return Strokes(joint, slides, *_columns(rows), "")
+            held = Finding("held_joint", REFUSES, subject, gone, limit=way, unit=_name(slides))
+            return Strokes(joint, slides, *_columns(rows), held)
+    return Strokes(joint, slides, *_columns(rows))
 
 
 def _columns(rows: Sequence[tuple[int, float, Reading]]) -> tuple[IntArray, FloatArray, tuple[Reading, ...]]:
@@ -213,11 +213,11 @@ def _direction(t_q: FloatArray, q: FloatArray, t: FloatArray, passing: float) ->
 
 
 def findings_of(
-    moved: Sequence[Strokes], numbers: Sequence[int], view: Sequence[str] = VIEWS, mount: str = WORLD
+    moved: Sequence[Strokes], numbers: Sequence[int], view: Sequence[str] = VIEWS
 ) -> Iterator[Finding]:
     """Findings of the strokes of all joints.
 
-    numbers : of the markers; view : names of the views; mount : of the cameras, on the tool or not.
+    numbers : of the markers; view : names of the views.
     """
     still, total = [], np.zeros((len(view), len(_LATENCIES)))
     most = np.zeros(len(view))  # motion of each image, px
@@ -225,16 +225,7 @@ def findings_of(
         signals = [_signal(trial, v) for v in range(len(view))]
         fits = [_passed(trial, signal) for signal in signals]
         if trial.given_up:
-            remedy = (
-                "free it, and check the supply; if its sag or backlash is that large, raise "
-                "plant.max_steady_state_error_deg"
-            )
-            yield Finding(
-                FAULT,
-                f"joint {trial.joint + 1}",
-                f"{trial.given_up}: it is held or too weak",
-                remedy,
-            )
+            yield trial.given_up
             continue
         spans = [np.ptp(signal.p) if len(signal.p) else 0.0 for signal in signals]
         most, span = np.maximum(most, spans), max(spans)
@@ -243,24 +234,18 @@ def findings_of(
         else:
             for v, fit in enumerate(fits):
                 total[v] += 0.0 if fit is None else fit.squares
-        yield from _of_servo(trial, [fit for fit in fits if fit is not None] if span >= _MOVES_PX else [])
-    yield from _of_still(still, len(moved), mount)
+        yield _of_servo(trial, [fit for fit in fits if fit is not None] if span >= _MOVES_PX else [])
+    if still:
+        yield _of_still(still, len(moved))
     for name, squares, px in zip(view, total, most, strict=True):
         if px < _MOVES_PX <= most.max():
-            what = f"its tags moved by {px:.1f} px with the joints ({_MOVES_PX:g} at least)"
-            yield Finding(FAULT, f"{name} camera", what, "look whether its image is live, and of this arm")
+            yield Finding("still_image", REFUSES, Subject(views=(name,)), px, limit=_MOVES_PX, unit="px")
         elif squares.any():
             latency = _minimum(squares)
-            remedy = (
-                "look for what queues frames: a hub, a network, a slow machine"
-                if latency > _MAX_LATENCY_S
-                else ""
-            )
-            yield Finding(
-                WARNING if remedy else FINE, f"{name} camera", f"latency {1e3 * latency:.0f} ms", remedy
-            )
+            code, level = ("long_latency", LIMITS) if latency > _MAX_LATENCY_S else ("latency", NOTE)
+            yield Finding(code, level, Subject(views=(name,)), latency, limit=_MAX_LATENCY_S, unit="s")
     if most.max() >= _MOVES_PX:
-        yield from _of_loose_tags(moved, numbers, mount)
+        yield from _of_loose_tags(moved, numbers)
 
 
 def _minimum(squares: FloatArray) -> float:
@@ -272,50 +257,31 @@ def _minimum(squares: FloatArray) -> float:
     return float(_LATENCIES[k] + 0.005 * np.clip(shift, -1.0, 1.0))
 
 
-def _of_servo(moved: Strokes, fits: Sequence[_Fit]) -> Iterator[Finding]:
+def _of_servo(moved: Strokes, fits: Sequence[_Fit]) -> Finding:
     """Hysteresis and sag of a joint, and backlash between its reading and the images."""
     below, above = (moved.rest(stroke) for stroke in (_FROM_BELOW, _FROM_ABOVE))
     hysteresis = float(moved.q[above].mean() - moved.q[below].mean())
     sag = float((moved.target - moved.q)[below + above].mean())
     best = [int(np.argmin(fit.squares)) for fit in fits]
     backlash = float(np.mean([fit.backlash[k] for fit, k in zip(fits, best, strict=True)])) if fits else 0.0
-    amounts = (("hysteresis", hysteresis), ("sag", abs(sag)))
-    parts = [f"{name} {_text(x, moved.slides)}" for name, x in amounts]
+    amounts = {"hysteresis": hysteresis, "sag": abs(sag)}
     if fits:
         hidden = abs(sag) > 2.0 * _NOTABLE and backlash < _NOTABLE
-        size = "hidden by gravity" if hidden else _text(max(backlash, 0.0), moved.slides)
-        parts.append(f"backlash {size}")
-    wide = max(hysteresis, backlash) > _WIDE
-    remedy = (
-        "teach goals by images, which backlash does not move; look for a loose horn or screw" if wide else ""
-    )
-    yield Finding(WARNING if wide else FINE, f"joint {moved.joint + 1}", ", ".join(parts), remedy)
+        amounts["backlash"] = math.nan if hidden else max(backlash, 0.0)
+    unit, name = _unit(moved.slides), _name(moved.slides)
+    parts = tuple(Finding("part", NOTE, Subject(name=one), unit * x, unit=name) for one, x in amounts.items())
+    code, level = ("wide_play", LIMITS) if max(hysteresis, backlash) > _WIDE else ("play", NOTE)
+    return Finding(code, level, Subject(joints=(moved.joint + 1,)), others=parts)
 
 
-def _of_still(still: Sequence[int], n: int, mount: str) -> Iterator[Finding]:
-    """Joints with which no tag moves in the images."""
-    if not still:
-        return
-    names = ", ".join(str(i + 1) for i in still)
-    where = f"joint{'s' if len(still) > 1 else ''} {names}"
-    if len(still) == n:
-        what, remedy = (
-            "turned, and no tag moved",
-            f"look whether the {'cameras' if mount == TOOL else 'tags'} are on this arm, and that the images "
-            "are live",
-        )
-    elif [*still] == [*range(still[0], n)] and mount == TOOL:
-        what = f"turned, and no tag moved: the cameras sit on the link before joint {still[0] + 1}"
-        remedy = "mount them behind the last joint"
-    elif [*still] == [*range(still[0], n)]:
-        what = f"turned, and no tag moved: the tags sit on the link before joint {still[0] + 1}"
-        remedy = "mount them behind the last joint, on the fixed part of the tool and not on a moving jaw"
-    else:
-        what, remedy = "turned, and no tag moved", "look at the order of the joints, and at their horns"
-    yield Finding(FAULT, where, what, remedy)
+def _of_still(still: Sequence[int], n: int) -> Finding:
+    """Joints of n with which no tag moves in the images."""
+    last = [*still] == [*range(still[0], n)]
+    code = "still_tags" if len(still) == n else "early_link" if last else "still_joint"
+    return Finding(code, REFUSES, Subject(joints=tuple(joint + 1 for joint in still)))
 
 
-def _of_loose_tags(moved: Sequence[Strokes], numbers: Sequence[int], mount: str) -> Iterator[Finding]:
+def _of_loose_tags(moved: Sequence[Strokes], numbers: Sequence[int]) -> Iterator[Finding]:
     """Tags that moved against the others between rests in the middle, come to from either side.
 
     Hysteresis and backlash leave small motions of the joints, which all tags follow by the images of the
@@ -341,10 +307,9 @@ def _of_loose_tags(moved: Sequence[Strokes], numbers: Sequence[int], mount: str)
                 worst[number] = max(worst.get(number, 0.0), float(left))
     if worst:
         number = max(worst, key=lambda trial: worst[trial])
-        what = f"tag {number} moved by {worst[number]:.1f} px against the others"
-        yield Finding(FAULT, "tags", what, "glue it flat on a stiff part, all tags on the same one")
+        yield Finding("loose_tag", REFUSES, Subject(tag=number), worst[number], unit="px")
     elif len(rests) > 1 and len(set(tag.tolist())) > 1:
-        yield Finding(FINE, "tags", f"sit fast {'in the scene' if mount == TOOL else 'on the tool'}")
+        yield Finding("fast_tags", NOTE)
 
 
 def _at_rest(moved: Strokes, stroke: int) -> FloatArray:

@@ -3,12 +3,15 @@
 import math
 from collections import deque
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
+from projservo_cli.findings import REFUSES, Finding
 from projservo_cli.hardware.so101 import COUNT, MIDDLE, TURN, Registers, Servos
 from projservo_cli.records import InputError, WorkFailed
+from projservo_cli.words import failed
 
 # Pause between readings, s, and readings whose median counts: a false one is none.
 _PERIOD_S, _MEDIAN = 0.02, 3
@@ -50,7 +53,7 @@ def limits_deg(
     kept = servos.registers()
     for k, i in enumerate(servos.ids, 1):
         if wrong := _unusable(moved[i], k, shift) or _kept_from(moved[i], kept[i]):
-            raise WorkFailed(f"{servos.name(i)} {wrong}")
+            raise failed([replace(wrong, subject=servos.subject(i))])
     limits, shifted = [], list[int]()
     for k, i in enumerate(servos.ids, 1):
         low, high = moved[i]
@@ -60,7 +63,7 @@ def limits_deg(
                 servos.shift(i, by)
             except WorkFailed as error:
                 words = f"; joints {shifted} store a new offset: record again" if shifted else ""
-                raise WorkFailed(f"{error}{words}") from error
+                raise WorkFailed(f"{error}{words}", findings=error.findings) from error
             shifted.append(k)
             low, high = low - by, high - by
         low, high = max(low, kept[i].lowest), min(high, kept[i].highest)
@@ -75,38 +78,27 @@ def _crosses(moved: _Moved) -> bool:
     return moved.lowest < 0 or moved.highest >= TURN
 
 
-def _kept_from(moved: _Moved, kept: Registers) -> str:
-    """Return how the limits that a servo stores cut the range of its joint; empty where they hardly do.
+def _kept_from(moved: _Moved, kept: Registers) -> Finding | None:
+    """Return how the limits that a servo stores cut the range of its joint; None where they hardly do.
 
     Those of a servo that is shifted must be those of a whole turn: its counts will mean other angles.
     """
     cut = max(kept.lowest - moved.lowest, moved.highest - kept.highest)
     whole = kept.lowest <= 0 and kept.highest >= TURN - 1
     if whole or (not _crosses(moved) and math.degrees(cut * COUNT) <= _WITHIN_DEG):
-        return ""
-    return (
-        f"stores limits of its own, {kept.lowest} to {kept.highest} counts (registers 9 and 11), and was "
-        f"moved from {moved.lowest} to {moved.highest}: set them to 0 and {TURN - 1} with the tool of its "
-        "maker, and run projservo limits again"
-    )
+        return None
+    stored = (Finding("range", amount=kept.lowest, limit=kept.highest, unit="1"),)
+    return Finding("kept_range", REFUSES, amount=moved.lowest, limit=moved.highest, unit="1", others=stored)
 
 
-def _unusable(moved: _Moved, joint: int, shift: Sequence[int]) -> str:
-    """Return the reason why the range of a joint gives no limits, with the remedy; empty if it does."""
-    span = math.degrees((moved.highest - moved.lowest) * COUNT)
-    if span < _MOVED_DEG:
-        return (
-            f"was moved by {span:.1f}° ({_MOVED_DEG:g}° at least): move each joint through all that is "
-            "allowed, and run projservo limits again"
-        )
-    if span >= math.degrees(TURN * COUNT):
-        return f"was moved by {span:.0f}°, a whole turn or more: its limits must be within one"
-    if _crosses(moved) and joint not in shift:
-        return (
-            "was moved over the end of its turn, where servos go the long way round: leave that place "
-            f"out, or run projservo limits --shift {joint}, which stores an offset in its servo"
-        )
-    return ""
+def _unusable(moved: _Moved, joint: int, shift: Sequence[int]) -> Finding | None:
+    """Return the reason why the range of a joint gives no limits; None if it does."""
+    span, least = (moved.highest - moved.lowest) * COUNT, math.radians(_MOVED_DEG)
+    if span < least:
+        return Finding("short_range", REFUSES, amount=span, limit=least, unit="rad")
+    if span >= TURN * COUNT:
+        return Finding("whole_turn", REFUSES, amount=span, unit="rad")
+    return Finding("crossed_turn", REFUSES) if _crosses(moved) and joint not in shift else None
 
 
 def require_known(joints: Sequence[int], count: int) -> None:

@@ -13,13 +13,17 @@ import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from projservo_cli.findings import LIMITS, REFUSES, Finding, Subject
 from projservo_cli.hardware.feetech import FeetechBus, PortLost, ServoSilent
 from projservo_cli.records import FloatArray, InputError, JointLimits, WorkFailed
+from projservo_cli.words import failed, line
+from projservo_cli.words.values import servo_name
 
 TURN = 4096  # counts of a servo in a turn
 MIDDLE = 2048  # count that is read as 0 rad
@@ -30,14 +34,13 @@ _STS3215 = 777  # register 3
 _MULTI_TURN = 0x10  # bit of register 18
 _OFFSET_SIGN = 0x800  # bit of register 31
 _OVERLOADED = 0x20  # bit of the status, until a servo gets another set-point
-# Each bit of the status of a servo in words, with the remedy.
-_WRONG = {
-    0x01: "its supply has {volts:.1f} V ({least:.1f} to {most:.1f} V): look at the supply",
-    0x02: "its angle sensor fails: replace it",
-    0x04: "it is too hot, {heat} °C: let it cool",
-    0x08: "its current is too high: free it",
-    _OVERLOADED: "it is overloaded, and pushes with a fifth of its torque: free it from its obstacle, "
-    "then start again",
+# Codes of the bits of the status of a servo.
+_FAULTS = {
+    0x01: "servo_supply",
+    0x02: "servo_sensor",
+    0x04: "servo_heat",
+    0x08: "servo_current",
+    _OVERLOADED: "servo_overload",
 }
 # Fastest that somebody turns a joint, or a servo does, rad/s, and what readings scatter, rad; more is no
 # reading.
@@ -142,8 +145,12 @@ class Servos:
 
     def name(self, number: int) -> str:
         """Name of a servo by its joint, for messages."""
-        servo = f"servo {number}"
-        return f"joint {self.ids.index(number) + 1} ({servo})" if number in self.ids else servo
+        return servo_name(self.subject(number))
+
+    def subject(self, number: int) -> Subject:
+        """Subject of findings on a servo."""
+        joints = (self.ids.index(number) + 1,) if number in self.ids else ()
+        return Subject(joints=joints, name=f"servo {number}")
 
     def measured(self) -> dict[int, _Measured]:
         """Return what each servo measures that is not lost."""
@@ -189,19 +196,21 @@ class Servos:
         finally:
             self.bus.store(_LOCK, {number: b"\1"})
 
-    def described(self, error: WorkFailed) -> str:
+    def failure(self, error: WorkFailed) -> Finding:
         """Tell which joints may fall where the bus fails; nothing more is written to them."""
+        told = Finding("told", REFUSES, Subject(name=str(error)))
         if not isinstance(error, ServoSilent):
-            return f"{error}; servos with power go on to their last set-points, and hold there"
-        if error.garbled:
-            self.lost |= {*error.silent}
-            return str(error)
-        if {*error.silent} >= {*self.alive}:
-            self.lost |= {*error.silent}
-            return "no servo answers any more: all joints may fall: hold the arm, and look at its supply"
+            return replace(told, code="lost_port")
+        silent = tuple(map(self.finding, error.silent))
+        everything = {*error.silent} >= {*self.alive}
         self.lost |= {*error.silent}
-        names = ", ".join(map(self.name, error.silent))
-        return f"{names}: no answer any more: it may fall with its load; check the cable to it"
+        if error.garbled:
+            return told
+        return Finding("silent_arm" if everything else "silent_servos", REFUSES, others=silent)
+
+    def finding(self, number: int) -> Finding:
+        """Return a part of a finding on several servos."""
+        return Finding("servo", subject=self.subject(number))
 
 
 class SO101:
@@ -272,8 +281,7 @@ class SO101:
         self._opened = True
         self.registers = self._servos.registers()
         for i in self._ids:
-            if wrong := self._unfit(i, self.registers[i]):
-                raise InputError(f"{self._servos.name(i)}: {wrong}")
+            self._require_fit(i, self.registers[i])
         self._read()
 
     def identity(self) -> str:
@@ -304,7 +312,8 @@ class SO101:
         for i, count in counts.items():
             least, most = self._keeps(i)
             if not least <= count <= most:
-                raise WorkFailed(f"{self._servos.name(i)}: {count} counts are beyond {least} to {most}")
+                kept = (Finding("range", amount=least, limit=most, unit="1"),)
+                raise self._failed("set_point_beyond", i, count, unit="1", others=kept)
         self._servos.send(counts, self._speeds())
         self._sent |= counts
 
@@ -321,10 +330,10 @@ class SO101:
         for i, sent in self._sent.items():
             turned = abs(there[i].at - sent) * COUNT
             if turned > _LEAP:
-                raise WorkFailed(
-                    f"{self._servos.name(i)} turned by {_deg(turned)} when its torque came on ({_deg(_LEAP)} "
-                    "at most): look what pulls at it"
-                )
+                raise self._failed("torque_leap", i, turned, limit=_LEAP, unit="rad")
+
+    def _failed(self, code: str, number: int, amount: float, **more: Any) -> WorkFailed:
+        return failed([Finding(code, REFUSES, self._servos.subject(number), amount, **more)])
 
     def act(self, name: str, value: float) -> float:
         """Open the gripper by a share, from 0, closed, to 1, and return how long that takes, s.
@@ -382,8 +391,8 @@ class SO101:
         """Release the port, and report whether the arm holds."""
         if self._opened:
             self._opened = False
-            words, all_answer = torque_reported(self._servos)
-            _say(words)
+            torque, all_answer = torque_reported(self._servos)
+            _say(line(torque))
             self._servos.bus.close()
             self._lease.end(moves=self._on and not all_answer)
 
@@ -405,56 +414,54 @@ class SO101:
         servos = self._read()
         for i, low, high in zip(self._ids, self._limits.lower, self._limits.upper, strict=True):
             q = servos[i].angle
-            beyond = max(low - q, q - high)
-            if beyond > _LEAP:
-                raise WorkFailed(
-                    f"nothing was moved: {self._servos.name(i)} stands at {_deg(q)}, {_deg(beyond)} beyond "
-                    f"its limits {_deg(low)} to {_deg(high)}: move it there by hand. If others do too, this "
-                    "is another arm (is it the leader's port?), or it was homed since: projservo limits"
-                )
+            if max(low - q, q - high) > _LEAP:
+                limits = (Finding("range", amount=float(low), limit=float(high), unit="rad"),)
+                raise self._failed("stands_beyond", i, q, unit="rad", others=limits)
 
-    def _unfit(self, number: int, stored: Registers) -> str:
-        """Return the reason why a joint would miss its set-point, with the remedy; empty if it does not."""
+    def _require_fit(self, number: int, stored: Registers) -> None:
+        """Refuse a servo whose joint would miss its set-points, with an InputError."""
+        name = self._servos.name(number)
         if stored.mode != 0:
-            return f"its mode (register 33) is {stored.mode}: set 0, position, with the tool of its maker"
+            raise InputError(
+                f"{name}: its mode (register 33) is {stored.mode}: set 0, position, by the tool of its maker"
+            )
         if stored.phase & _MULTI_TURN:
             wanted = stored.phase & ~_MULTI_TURN
-            return f"it counts several turns (register 18 is {stored.phase}): set {wanted}"
+            raise InputError(f"{name}: it counts several turns (register 18 is {stored.phase}): set {wanted}")
         if self._limits is None:
-            return ""
+            return
         k, (least, most) = self._ids.index(number), self._keeps(number)
         low, high = self._limits.lower[k], self._limits.upper[k]
-        if least <= round(MIDDLE + low / COUNT) < round(MIDDLE + high / COUNT) <= most:
-            return ""
-        kept = " to ".join(_deg((x - MIDDLE) * COUNT) for x in (least, most))
-        return (
-            f"its limits, {_deg(low)} to {_deg(high)}, go beyond those that it keeps itself, {kept} "
-            "(registers 9 and 11): run projservo limits again"
-        )
+        if not least <= round(MIDDLE + low / COUNT) < round(MIDDLE + high / COUNT) <= most:
+            kept = " to ".join(_deg((x - MIDDLE) * COUNT) for x in (least, most))
+            raise InputError(
+                f"{name}: its limits, {_deg(low)} to {_deg(high)}, go beyond those that it keeps itself, "
+                f"{kept} (registers 9 and 11): run projservo limits again"
+            )
 
     def _read(self) -> dict[int, _Measured]:
         """Return the measurements of all servos; repeat an impossible reading, or one with a fault.
 
         The first one counts where a second agrees with it.
         """
-        servos, wrong = dict[int, _Measured](), ""
+        servos, wrong = dict[int, _Measured](), list[Finding]()
         for _ in range(_REPEATS):
             try:
                 servos = self._servos.measured()
             except (ServoSilent, PortLost) as error:
-                raise WorkFailed(self._servos.described(error)) from error
+                raise failed([self._servos.failure(error)]) from error
             now = self.now()
-            wrong = self._leapt(servos, now - self._read_at) or self._faulty(servos)
+            wrong = [*self._leapt(servos, now - self._read_at), *self._faulty(servos)][:1]
             agreed = not wrong and bool(self._before)
             if agreed or not self._agreed:
                 self._before, self._read_at, self._agreed = servos, now, agreed
             if agreed:
                 return servos
         self._servos.lost |= {i for i, servo in servos.items() if servo.status}
-        raise WorkFailed(wrong)
+        raise failed(wrong)
 
-    def _leapt(self, servos: Mapping[int, _Measured], seconds: float) -> str:
-        """Return the joint whose reading is impossible since the last one; empty for none."""
+    def _leapt(self, servos: Mapping[int, _Measured], seconds: float) -> Iterator[Finding]:
+        """Yield the joints whose reading is impossible since the last one."""
         most = _FASTEST * seconds + _SCATTER
         if self._on and self._limits is not None:
             fastest = 2.0 * _CATCHES_UP * max(_GRIPPER, float(self._limits.speed.max()))
@@ -462,24 +469,23 @@ class SO101:
         for i, servo in servos.items():
             before = self._before.get(i)
             if servo.at >= TURN or (before is not None and abs(servo.at - before.at) * COUNT > most):
-                last = "" if before is None else f", {1000 * seconds:.0f} ms after {_deg(before.angle)}"
-                return (
-                    f"{self._servos.name(i)} reads {_deg(servo.angle)}{last}: no joint turns so fast: look "
-                    "at its gear and its cable"
-                )
-        return ""
+                last = () if before is None else (Finding("last", amount=before.angle, unit="rad"),)
+                subject = self._servos.subject(i)
+                yield Finding("impossible_reading", REFUSES, subject, servo.angle, unit="rad", others=last)
 
-    def _faulty(self, servos: Mapping[int, _Measured]) -> str:
-        """Return the servo that reports a fault, with the remedy; empty for none."""
+    def _faulty(self, servos: Mapping[int, _Measured]) -> Iterator[Finding]:
+        """Yield the faults that servos report."""
         for i, servo in servos.items():
-            for bit, words in _WRONG.items():
+            amounts = {"servo_supply": (servo.volts, "V"), "servo_heat": (servo.heat, "°C")}
+            least, most = self._servos.volts[i]
+            supply = (Finding("range", amount=least, limit=most, unit="V"),)
+            for bit, code in _FAULTS.items():
                 # The first set-point ends an overload of before.
                 pushes = bit == _OVERLOADED and (i in self._others or not self._on)  # as a grip does
                 if servo.status & bit and not pushes:
-                    least, most = self._servos.volts[i]
-                    what = words.format(volts=servo.volts, heat=servo.heat, least=least, most=most)
-                    return f"{self._servos.name(i)}: {what}; it is sent nothing more, and may sink"
-        return ""
+                    amount, unit = amounts.get(code, (math.nan, ""))
+                    subject = self._servos.subject(i)
+                    yield Finding(code, REFUSES, subject, amount, unit=unit, others=supply)
 
 
 @contextmanager
@@ -493,18 +499,18 @@ def connected(arm: SO101, *, whole: bool = True) -> Iterator[Servos]:
         arm._lease.end()
 
 
-def torque_reported(servos: Servos) -> tuple[str, bool]:
+def torque_reported(servos: Servos) -> tuple[Finding, bool]:
     """Report whether torque is on, at the end of whatever was done with an arm, and whether that is known."""
     try:
         on = servos.torque()
     except (ServoSilent, PortLost):
-        return "whether torque is on is not known, since servos do not answer: hold the arm", False
+        return Finding("torque_unknown", LIMITS), False
     holding, all_answer = [i for i in servos.ids if on.get(i)], not servos.lost
     if not holding:
-        return "torque is off: nothing holds the arm", all_answer
+        return Finding("torque_off"), all_answer
     if len(holding) < len(servos.ids):
-        return f"torque is on in {', '.join(map(servos.name, holding))} alone: hold the arm", all_answer
-    return "torque is on: the arm holds where it is; projservo release lets go of it", all_answer
+        return Finding("torque_in_part", LIMITS, others=tuple(map(servos.finding, holding))), all_answer
+    return Finding("torque_on"), all_answer
 
 
 class _Lease:

@@ -12,13 +12,16 @@ import struct
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from projservo_cli import words
 from projservo_cli.detection import opencv, unfit
+from projservo_cli.findings import LIMITS, REFUSES, Finding, Subject
 from projservo_cli.records import ByteArray, InputError, WorkFailed
 from projservo_cli.settings.cameras import Source, device_of
 
@@ -57,7 +60,7 @@ class VideoCamera:
     """A camera that is always grabbed.
 
     name : of it, such as ``left``. now : clock of the stamps, s.
-    ``remarks``: what its driver would not do, in words.
+    ``remarks``: what its driver would not do.
     """
 
     def __init__(
@@ -70,13 +73,14 @@ class VideoCamera:
     ) -> None:
         self.name, self.settings, self._now = name, settings, now
         self._max_age_s, self._reconnect_s = max_age_s, reconnect_s
-        self.remarks: list[str] = []
+        self.remarks: list[Finding] = []
         self.reconnections = 0
         self.stamped = False  # whether frames carry stamps of the driver
         self._stamps: deque[float] = deque(maxlen=_TIMED)
         self._frame: Frame | None = None
-        self._why = "it has given none yet"
-        self._refused = ""  # why no frame of it will do
+        self._where = Subject(views=(name,))
+        self._why = Finding("frameless", REFUSES, self._where)
+        self._refused: Finding | None = None  # why no frame of it will do
         self._came = threading.Condition()
         self._closing = threading.Event()
         self._grabbing: threading.Thread | None = None
@@ -85,6 +89,9 @@ class VideoCamera:
     def where(self) -> str:
         """Name and source, for messages."""
         return f"the {self.name} camera (cameras.{self.name}.source: {self.settings.source})"
+
+    def _failed(self, why: Finding) -> WorkFailed:
+        return words.failed([why], begin=f"{self.where}: ")
 
     def open(self) -> None:
         """Connect, and wait for the first frame; WorkFailed if there is none."""
@@ -101,16 +108,9 @@ class VideoCamera:
         if self._refused or self._frame is None:
             self.close()
             device = device_of(self.settings.source)
-            holder = _holder(device) if device is not None else ""
-            raise WorkFailed(
-                f"{self.where}: {self._refused or holder or f'gives no frame within {_FIRST_S:g} s'}"
-                + (
-                    ""
-                    if self._refused or holder
-                    else ": look at cable and hub; two webcams on one USB 2 hub "
-                    f"need cameras.{self.name}.fourcc: MJPG or a smaller size_px"
-                )
-            )
+            holder = None if device is None else _holder(device, self._where)
+            late = Finding("no_frame", REFUSES, self._where, _FIRST_S, unit="s")
+            raise self._failed(self._refused or holder or late)
 
     def newest(self) -> Frame:
         """Newest frame, waited for while the camera reconnects; WorkFailed where that takes too long."""
@@ -119,13 +119,13 @@ class VideoCamera:
             assert frame is not None
             age = self._now() - frame.t
             if self._refused:
-                raise WorkFailed(f"{self.where}: {self._refused}")
+                raise self._failed(self._refused)
             if age <= self._max_age_s:
                 return frame
             if age > self._reconnect_s:
-                raise WorkFailed(
-                    f"{self.where}: no frame for {age:.2g} s ({self._reconnect_s:g} s at most, "
-                    f"cameras.reconnect_s): {self._why}: look at its cable and hub"
+                most, why = self._reconnect_s, (self._why,)
+                raise self._failed(
+                    Finding("lost_camera", REFUSES, self._where, age, limit=most, unit="s", others=why)
                 )
             with self._came:
                 self._came.wait(0.01)
@@ -165,7 +165,7 @@ class VideoCamera:
                     capture = self._connected()
                     self.reconnections += 1
                 except WorkFailed as error:
-                    self._why = str(error).removeprefix(f"{self.where}: ")
+                    (self._why,) = error.findings
                     self._closing.wait(_RETRY_S)
                 continue
             came, image = capture.read()
@@ -178,7 +178,7 @@ class VideoCamera:
                         1.0 / (self.settings.rate_hz or capture.get(_cv().CAP_PROP_FPS) or 30.0)
                     )
                 continue
-            self._why = "it stopped giving frames"
+            self._why = Finding("stopped_frames", REFUSES, self._where)
             capture.release()
             capture = None
         if capture is not None:
@@ -193,20 +193,15 @@ class VideoCamera:
         cv = _cv()
         grey = np.asarray(image if image.ndim == 2 else cv.cvtColor(image, cv.COLOR_BGR2GRAY), dtype=np.uint8)
         before, wanted = self._frame, self.settings.size_px
-        size, wrong = grey.shape[::-1], unfit(image) if self._frame is None else ""
+        size, wrong = grey.shape[::-1], unfit(image) if self._frame is None else None
+        own = Finding("", REFUSES, self._where, size[0], limit=size[1], unit="px")
         with self._came:
-            if wrong:
-                self._refused = f"each of its frames {wrong}"
+            if wrong is not None:
+                self._refused = replace(wrong, subject=self._where)
             elif wanted is not None and size != tuple(wanted):
-                self._refused = (
-                    f"gives frames of {size[0]} x {size[1]} px, not the {wanted[0]} x {wanted[1]} of "
-                    f"cameras.{self.name}.size_px: set a size that it has"
-                )
+                self._refused = replace(own, code="other_size", others=(_size(*wanted),))
             elif before is not None and before.grey.shape != grey.shape:
-                self._refused = (
-                    f"changed its frames from {before.grey.shape[1]} x {before.grey.shape[0]} px to "
-                    f"{size[0]} x {size[1]}: set cameras.{self.name}.size_px"
-                )
+                self._refused = replace(own, code="changed_size", others=(_size(*before.grey.shape[::-1]),))
             else:
                 self._frame = Frame(grey, t, 1 if before is None else before.serial + 1)
                 self._stamps.append(t)
@@ -228,8 +223,8 @@ class VideoCamera:
         if device is not None:
             if device.exists() and not re.fullmatch(r"video\d+", device.name):
                 raise InputError(f"{self.where}: is no camera: name one of the devices: {_listed(_nodes())}")
-            if wrong := _wrong_device(device):
-                raise WorkFailed(f"{self.where}: {wrong}")
+            if wrong := _wrong_device(device, self._where):
+                raise self._failed(wrong)
             capture = cv.VideoCapture(int(device.name.removeprefix("video")), cv.CAP_V4L2)
         elif isinstance(source, str) and "://" in source:
             limits = [cv.CAP_PROP_OPEN_TIMEOUT_MSEC, _OPEN_MS, cv.CAP_PROP_READ_TIMEOUT_MSEC, _READ_MS]
@@ -237,13 +232,16 @@ class VideoCamera:
         else:
             capture = cv.VideoCapture(source)
         if not capture.isOpened():
-            holder = _holder(device) if device is not None else ""
-            raise WorkFailed(
-                f"{self.where}: {holder or 'cannot be opened: look at its name, cable and power'}"
-            )
+            holder = None if device is None else _holder(device, self._where)
+            raise self._failed(holder or Finding("unopened", REFUSES, self._where))
         if isinstance(source, int) or device is not None:
-            self.remarks = list(_set_up(capture, self.settings))
+            self.remarks = list(_set_up(capture, self.settings, self._where))
         return capture
+
+
+def _size(width: int, height: int) -> Finding:
+    """Size of other frames."""
+    return Finding("size", amount=width, limit=height, unit="px")
 
 
 def _cv() -> Any:
@@ -255,8 +253,8 @@ def _cv() -> Any:
     return cv
 
 
-def _set_up(capture: Any, settings: Source) -> Iterator[str]:
-    """Set format, size, rate, exposure and focus of a device; return what it did not take, in words."""
+def _set_up(capture: Any, settings: Source, where: Subject) -> Iterator[Finding]:
+    """Set format, size, rate, exposure and focus of a device; yield what it did not take."""
     cv = _cv()
     capture.set(cv.CAP_PROP_FOURCC, cv.VideoWriter.fourcc(*settings.fourcc))
     if settings.size_px is not None:
@@ -272,26 +270,24 @@ def _set_up(capture: Any, settings: Source) -> Iterator[str]:
     exposes = settings.exposure_ms is None or _expose(capture, settings.exposure_ms, v4l)
     # Drivers take settings without a word and keep their own: what they have afterwards counts.
     if v4l and (code := _code_of(capture.get(cv.CAP_PROP_FOURCC))) not in ("", settings.fourcc):
-        yield f"sends {code}, not the {settings.fourcc} of fourcc: set fourcc: {code}, or take another camera"
+        asked = Finding("asked", subject=Subject(name=settings.fourcc))
+        yield Finding("other_format", LIMITS, replace(where, name=code), others=(asked,))
     if capture.get(cv.CAP_PROP_AUTOFOCUS) == 1:
-        yield "autofocus is on, and its driver does not switch it off: a camera that refocuses is another one"
+        yield Finding("autofocus", LIMITS, where)
     if settings.focus is not None:
         focus = capture.get(cv.CAP_PROP_FOCUS)
         if not focuses or (focus != _UNKNOWN and abs(focus - settings.focus) > _FOCUS_STEP):
-            yield f"its driver does not set the focus to {settings.focus:g}{_instead(focus)}"
+            yield Finding("unset_focus", LIMITS, where, _told(focus), limit=settings.focus)
     if settings.exposure_ms is None:
-        yield "its exposure is automatic: fix it with exposure_ms, below a frame's time"
+        yield Finding("free_exposure", LIMITS, where)
         return
     if v4l and capture.get(cv.CAP_PROP_AUTO_EXPOSURE) in _V4L_AUTOMATIC:
-        yield "its exposure stays automatic, against exposure_ms: add light, or take another camera"
+        yield Finding("kept_exposure", LIMITS, where)
         return
     value = capture.get(cv.CAP_PROP_EXPOSURE)
     time_ms = value if value in (0, _UNKNOWN) else 0.1 * value if v4l else 1e3 * 2.0**value
     if not exposes or (time_ms > 0 and abs(math.log2(time_ms / settings.exposure_ms)) > _EXPOSURE_STEP):
-        yield (
-            f"its driver does not fix the exposure at {settings.exposure_ms:g} ms{_instead(time_ms, ' ms')}: "
-            "set an exposure_ms that it takes"
-        )
+        yield Finding("unset_exposure", LIMITS, where, _told(time_ms), limit=settings.exposure_ms, unit="ms")
 
 
 def _expose(capture: Any, exposure_ms: float, v4l: bool) -> bool:
@@ -309,9 +305,9 @@ def _code_of(number: float) -> str:
     return code if code.isascii() and code.isprintable() else ""
 
 
-def _instead(value: float, unit: str = "") -> str:
-    """Words on what a driver has instead of what it was sent; empty where it does not say."""
-    return "" if value in (0, _UNKNOWN) else f", it has {value:.3g}{unit}"
+def _told(value: float) -> float:
+    """Return the value that a driver tells; NaN where it does not say."""
+    return math.nan if value in (0, _UNKNOWN) else value
 
 
 def stable_name(source: int | str) -> str:
@@ -348,31 +344,36 @@ def _listed(nodes: list[Path]) -> str:
     return ", ".join(map(str, nodes)) or "none: look at the cable"
 
 
-def _wrong_device(device: Path) -> str:
-    """Return the reason why a device node gives no pictures, with the remedy; empty if it may."""
-    others = _nodes()
+def _wrong_device(device: Path, where: Subject) -> Finding | None:
+    """Return the reason why a device node gives no pictures; None if it may."""
+    others, subject = _nodes(), replace(where, name=str(device))
     if not device.exists():
-        return f"there is no {device}; devices: {_listed(others)}"
+        return Finding("no_device", REFUSES, subject, others=_devices(others))
     if not os.access(device, os.R_OK | os.W_OK):
-        return f"{device} may not be read: sudo usermod -aG video $USER, then log in again"
+        return Finding("unreadable_device", REFUSES, subject)
     own = _capabilities(device)
     if own is None or own[0] & _GIVES_PICTURES:
-        return ""
+        return None
     same = [
-        str(node)
+        node
         for node in others
         if (other := _capabilities(node)) and other[1] == own[1] and other[0] & _GIVES_PICTURES
     ]
-    remedy = f"take {same[0]}" if same else "take another device"
-    return f"{device} gives no pictures: it is the second node of a webcam, for metadata: {remedy}"
+    return Finding("second_node", REFUSES, subject, others=_devices(same))
 
 
-def _holder(device: Path) -> str:
-    """Which other process has a device open, with the remedy; empty where none of this user's shows."""
+def _devices(nodes: Sequence[Path]) -> tuple[Finding, ...]:
+    """Devices that there are."""
+    return tuple(Finding("device", subject=Subject(name=str(node))) for node in nodes)
+
+
+def _holder(device: Path, where: Subject) -> Finding | None:
+    """Tell which other process has a device open; None where none of this user's shows."""
     for link in Path("/proc").glob("[0-9]*/fd/*"):
         number = int(link.parts[2])
         with contextlib.suppress(OSError):
             if number != os.getpid() and link.readlink() == device:
                 name = Path("/proc", str(number), "comm").read_text(encoding="utf-8").strip()
-                return f"{device} is in use by {name} (process {number}): close that"
-    return ""
+                process = Finding("process", subject=Subject(name=name), amount=number)
+                return Finding("held_device", REFUSES, replace(where, name=str(device)), others=(process,))
+    return None

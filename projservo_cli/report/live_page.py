@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from projservo_cli.detection import opencv
-from projservo_cli.hardware.checks_at_rest import Finding
 from projservo_cli.records import CORNERS, ByteArray, FloatArray
 from projservo_cli.report.html import embedded, html_page
 
@@ -40,8 +39,8 @@ def annotated(grey: ByteArray, marker: Sequence[int], pixels: FloatArray, goal: 
     return bytes(cv.imencode(".jpg", image, [cv.IMWRITE_JPEG_QUALITY, 90])[1].tobytes())
 
 
-def preflight_page(name: str, findings: Sequence[Finding], pictures: Mapping[str, bytes]) -> str:
-    """One file of HTML with the findings of a preflight and a picture of each view, JPEG."""
+def preflight_page(name: str, findings: Sequence[Mapping[str, Any]], pictures: Mapping[str, bytes]) -> str:
+    """One file of HTML with the findings of a preflight, as rows, and a picture of each view, JPEG."""
     title = f"Preflight of {name}"
     return html_page("cameras.html", title=title, images=_within(pictures), findings=findings)
 

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from projservo_cli.calibration.time_offset import is_repeated_frame, time_unit
+from projservo_cli.findings import LIMITS, Finding, Subject
 from projservo_cli.image_size import ImageSize, image_sizes
 from projservo_cli.plugins import what_failed
 from projservo_cli.records import (
@@ -277,9 +278,13 @@ class PluginRobot:
         """Return the measurements of the robot on itself, such as its voltage, by name; may be empty."""
         return dict(self._optional("health", {}))
 
-    def remarks(self) -> list[str]:
-        """Return the faults of the last images that the robot finds, in words; may be empty."""
-        return list(self._optional("remarks", ()))
+    def remarks(self) -> list[Finding]:
+        """Return the faults of the last images that the robot finds; may be empty."""
+        found = self._optional("remarks", ())
+        return [
+            one if isinstance(one, Finding) else Finding("told", LIMITS, Subject(name=str(one)))
+            for one in found
+        ]
 
     def identity(self) -> str:
         """Return a text that changes with the meaning of the readings; may be empty."""
@@ -426,7 +431,7 @@ class PluginRobot:
         if isinstance(error, (KeyboardInterrupt, InputError)):
             raise error
         if isinstance(error, WorkFailed):  # of a class that says it in words
-            raise WorkFailed(f"{self.name}: {error}") from error
+            raise WorkFailed(f"{self.name}: {error}", findings=error.findings) from error
         if error is not None:
             raise WorkFailed(f"{self.name}: {what}() failed: {what_failed(error)}") from error
         return order.result()
@@ -646,7 +651,8 @@ def at_rest_after(robot: PluginRobot) -> Iterator[None]:
             try:
                 robot.stop()
             except WorkFailed as failure:
-                raise WorkFailed(f"{_line(error)}; and {failure}") from error
+                found = *getattr(error, "findings", ()), *failure.findings
+                raise WorkFailed(f"{_line(error)}; and {failure}", findings=found) from error
             raise
         else:
             robot.stop()

@@ -8,7 +8,7 @@ from typing import Annotated
 
 from pydantic import Field, Strict, StrictInt, StrictStr, StringConstraints
 
-from projservo_cli.settings.sections import ByView, Count, Finding, NotNegative, Positive, Section
+from projservo_cli.settings.sections import ByView, Count, Note, NotNegative, Positive, Section
 
 
 class Source(Section):
@@ -29,7 +29,7 @@ class Source(Section):
         None, description="of a device, in units of its driver; null leaves it where it stands; no autofocus"
     )
 
-    def contradictions(self) -> Iterator[Finding]:
+    def contradictions(self) -> Iterator[Note]:
         """An index that is text would be taken for a film of that name."""
         if isinstance(self.source, str) and self.source.isdecimal():
             yield ("source",), f"is text: an index has no quotes: source: {int(self.source)}"
@@ -59,7 +59,7 @@ class Cameras(ByView):
         1.5, description="within which a lost camera must give frames again; the arm holds meanwhile"
     )
 
-    def contradictions(self) -> Iterator[Finding]:
+    def contradictions(self) -> Iterator[Note]:
         """No camera, one twice, a name that is none, or no time to reconnect."""
         yield from super().contradictions()
         if not self.sources:

@@ -10,7 +10,7 @@ from pydantic_core import PydanticCustomError
 from projservo_cli import plugins
 from projservo_cli.laws import LAW_SPECS, LAWS, mode_in
 from projservo_cli.settings.disturbance import Delays
-from projservo_cli.settings.sections import Count, Finding, NotNegative, Number, Positive, Section, Whole
+from projservo_cli.settings.sections import Count, Note, NotNegative, Number, Positive, Section, Whole
 
 
 def _law(name: str) -> str:
@@ -123,7 +123,7 @@ class Control(Section):
         "visible markers; null: body if the calibration is usable",
     )
 
-    def contradictions(self) -> Iterator[Finding]:
+    def contradictions(self) -> Iterator[Note]:
         """Gains that overshoot."""
         for name in ("gain_t", "gain_r", "gain_p", "gain_s", "gain"):
             product = getattr(self, name) * self.period_s

@@ -11,7 +11,7 @@ from projservo_cli.settings.objects import Displacement
 from projservo_cli.settings.sections import (
     ByView,
     Count,
-    Finding,
+    Note,
     NotNegative,
     Number,
     Positive,
@@ -42,7 +42,7 @@ class JointMoved(Section):
         False, description="whether the link slips on its encoder, so that the reading stays the same"
     )
 
-    def contradictions(self) -> Iterator[Finding]:
+    def contradictions(self) -> Iterator[Note]:
         """An angle and a distance, or neither."""
         if (self.by_deg is None) == (self.by_m is None):
             yield (), "give exactly one of by_deg and by_m"
@@ -153,7 +153,7 @@ class Faults(Section):
         0.0, description="backlash between each encoder and its link, from end to end"
     )
 
-    def contradictions(self) -> Iterator[Finding]:
+    def contradictions(self) -> Iterator[Note]:
         """Yield latencies of images not taken yet, and keys without effect because another is missing."""
         if (least := min(latency or 0.0 for _, latency in self.camera_latency_s)) < 0:
             yield ("camera_latency_s",), f"{least:g} is negative: no image comes before it was taken"

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BeforeValidator, Field, WithJsonSchema
 
 from projservo_cli.records import KINDS, MEET, PARALLEL, PERPENDICULAR
-from projservo_cli.settings.sections import Finding, Number, Section, Whole
+from projservo_cli.settings.sections import Note, Number, Section, Whole
 
 _TOOL, _SCENE = "tool", "scene"
 _RELATIONS = (MEET, PARALLEL, PERPENDICULAR)
@@ -70,7 +70,7 @@ class Feature(Section):
         None, description="numbers of three markers, in the sense of the plane; or as for a point"
     )
 
-    def contradictions(self) -> Iterator[Finding]:
+    def contradictions(self) -> Iterator[Note]:
         """No kind or several, markers of the scene, and a tool that names another feature."""
         kinds = self.given(*KINDS)
         if len(kinds) != 1:

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from projservo_cli.detection import LEAST_ROWS, Board
 from projservo_cli.records import CORNERS, FloatArray
-from projservo_cli.settings.sections import Finding, Matrix44, Positive, Section, Vector3, Whole, not_rigid
+from projservo_cli.settings.sections import Matrix44, Note, Positive, Section, Vector3, Whole, not_rigid
 
 GROUND = 4.0 / 3.0
 """Width of a tag of six cells with a bright margin of one cell, over that without."""
@@ -32,7 +32,7 @@ class Tag(Section):
         "y is up on it"
     )
 
-    def contradictions(self) -> Iterator[Finding]:
+    def contradictions(self) -> Iterator[Note]:
         """A tag that is nowhere."""
         if what := not_rigid(self.pose):
             yield ("pose",), what
@@ -70,7 +70,7 @@ class BoardSettings(Section):
         """The board as it is detected."""
         return Board(self.kind, self.rows, self.columns, self.first or 0)
 
-    def contradictions(self) -> Iterator[Finding]:
+    def contradictions(self) -> Iterator[Note]:
         """Tags of a board without."""
         for key in ("dictionary", "first"):
             if self.kind == "chessboard" and getattr(self, key) is not None:
@@ -214,7 +214,7 @@ class Markers(Section):
         found = np.linalg.norm(X[:, None] - X, axis=2)
         return np.asarray(np.where(tag[:, None] == tag, found, np.nan))
 
-    def contradictions(self) -> Iterator[Finding]:
+    def contradictions(self) -> Iterator[Note]:
         """Markers said twice; numbers that are missing, strange or given twice."""
         for key in ("positions_m", "numbers") if self.tags is not None else ():
             if getattr(self, key) is not None:
@@ -239,7 +239,7 @@ class Markers(Section):
         if len(set(face)) < len(face):
             yield ("face",), "a marker stands here twice"
 
-    def unknown(self, numbers: Sequence[int], *path: str) -> Iterator[Finding]:
+    def unknown(self, numbers: Sequence[int], *path: str) -> Iterator[Note]:
         """Numbers at a path that no marker has, as far as markers are known."""
         for i, number in enumerate(numbers):
             if self.known is not None and number not in self.known:

@@ -11,7 +11,7 @@ from projservo_cli.geometry.displacements import rigid
 from projservo_cli.records import CORNERS, FloatArray
 from projservo_cli.settings.features import is_name
 from projservo_cli.settings.markers import Tag
-from projservo_cli.settings.sections import Finding, Positive, Section, Vector3, Whole
+from projservo_cli.settings.sections import Note, Positive, Section, Vector3, Whole
 
 WORLD_AND_TOOL = ("scene", "tool")
 """What a feature moves with besides objects, whose names they cannot be."""
@@ -93,7 +93,7 @@ class ObjectSettings(Section):
         assert self.points is not None
         return self.displacement.about(self.points[:, :3].mean(axis=0))
 
-    def contradictions(self) -> Iterator[Finding]:
+    def contradictions(self) -> Iterator[Note]:
         """No markers, too few or the same twice, and places of others than these."""
         if len(self.given("tags", "markers")) != 1:
             yield (), "give exactly one of tags and markers"
@@ -134,7 +134,7 @@ class Objects(Section):
         """Return the objects by their names."""
         return self.model_extra or {}
 
-    def contradictions(self) -> Iterator[Finding]:
+    def contradictions(self) -> Iterator[Note]:
         """Yield names that are none, and markers of two objects."""
         owner = dict[int, str]()
         for name, one in self.named.items():

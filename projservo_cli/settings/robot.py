@@ -10,10 +10,10 @@ from pydantic import Field, StringConstraints
 from projservo_cli.records import TWO_TURNS, VIEWS
 from projservo_cli.settings.sections import (
     ByView,
-    Finding,
     JointVector,
     Matrix34,
     Matrix44,
+    Note,
     NotNegative,
     Number,
     Positive,
@@ -63,7 +63,7 @@ class _Joint(Section):
             return math.radians(self.limits_deg[0]), math.radians(self.limits_deg[1])
         return self.limits_rad or self.limits_m or (-math.inf, math.inf)
 
-    def contradictions(self) -> Iterator[Finding]:
+    def contradictions(self) -> Iterator[Note]:
         """Limits in two units, of the other type of joint, or upside down."""
         given = self.given("limits_deg", "limits_rad", "limits_m")
         if len(given) > 1:
@@ -94,7 +94,7 @@ class _ScrewJoint(_Joint):
     w: Vector3 = Field(description="unit axis of a revolute joint, zero for a prismatic one")
     v: Vector3 = Field(description="-w × a point of the axis, m; unit direction of a prismatic joint")
 
-    def contradictions(self) -> Iterator[Finding]:
+    def contradictions(self) -> Iterator[Note]:
         """Wrong limits, an axis that is not of unit length, or a joint that turns and slides."""
         yield from super().contradictions()
         yield from (((key,), what) for key, what in not_a_screw(self.type, self.w, self.v))
@@ -111,7 +111,7 @@ class _DH(Section):
     )
     tool: Matrix44 = Field(_IDENTITY, description="pose of the tool in the frame of the last joint, m")
 
-    def contradictions(self) -> Iterator[Finding]:
+    def contradictions(self) -> Iterator[Note]:
         """A tool that is nowhere."""
         if what := not_rigid(self.tool):
             yield ("tool",), what
@@ -126,7 +126,7 @@ class _Screws(Section):
         min_length=1, max_length=64, description="joint screws, base to tool"
     )
 
-    def contradictions(self) -> Iterator[Finding]:
+    def contradictions(self) -> Iterator[Note]:
         """A reading too many or too few, or a tool that is nowhere."""
         yield from self.reference.miscounted("".join(joint.type for joint in self.joints), "reference")
         if what := not_rigid(self.base_tool):
@@ -146,7 +146,7 @@ class _Limits(Section):
         "this fraction",
     )
 
-    def contradictions(self) -> Iterator[Finding]:
+    def contradictions(self) -> Iterator[Note]:
         """Two ways to say them or none, a unit too many or too few, or limits upside down."""
         if (self.joints is None) == (self.from_data is None):
             yield (), "give exactly one of joints and from_data"
@@ -198,7 +198,7 @@ class RobotSettings(Section):
         """Lowest and highest reading of each joint of dh or screws, rad or m; infinite where none is set."""
         return tuple(joint.limits for joint in self.joints)
 
-    def contradictions(self) -> Iterator[Finding]:
+    def contradictions(self) -> Iterator[Note]:
         """Yield missing or several descriptions of joints and limits; a file without a tip."""
         screws = None if self.mjcf is not None else self.screws  # those of the file
         if (self.dh, screws, self.mjcf, self.urdf, self.limits).count(None) != 4:
@@ -224,7 +224,7 @@ class Camera(Section):
         "focal length",
     )
 
-    def contradictions(self) -> Iterator[Finding]:
+    def contradictions(self) -> Iterator[Note]:
         """Two descriptions, half a one, or one that is no camera."""
         wanted = ("focal_px", "principal_point_px", "position_m", "target_m")
         given = self.given(*wanted)
@@ -264,7 +264,7 @@ class Rig(ByView):
         found = self.__pydantic_extra__ or {}
         return {name: found[name] for name in (*filter(found.__contains__, VIEWS), *found)}
 
-    def contradictions(self) -> Iterator[Finding]:
+    def contradictions(self) -> Iterator[Note]:
         """No camera, a name that no column can have, or sizes of other numbers of images."""
         yield from super().contradictions()
         names = [*self.cameras]

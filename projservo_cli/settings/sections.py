@@ -68,7 +68,7 @@ SizesByName = Annotated[
     WithJsonSchema({"anyOf": [_SIZE, _SIZES, {"type": "object", "additionalProperties": _SIZE}]}),
 ]
 # The path from a section to a value in it, and the error of that value.
-Finding = tuple[tuple[str | int, ...], str]
+Note = tuple[tuple[str | int, ...], str]
 _TOLERANCE = 1e-6  # of rotations and unit axes written with seven digits or more
 CONTRADICTIONS = "contradictions"  # type of the error that holds them
 
@@ -80,7 +80,7 @@ class Section(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    def contradictions(self) -> Iterable[Finding]:
+    def contradictions(self) -> Iterable[Note]:
         """Yield the contradictions of this section, each value of which is valid by itself."""
         return ()
 
@@ -103,7 +103,7 @@ class ByView(Section):
 
     model_config = ConfigDict(extra="allow")
 
-    def contradictions(self) -> Iterator[Finding]:
+    def contradictions(self) -> Iterator[Note]:
         """Yield names that no column of a table can have."""
         for name in self.model_extra or ():
             if not is_view(name):
@@ -127,7 +127,7 @@ class Root(Section):
             raise PydanticCustomError(CONTRADICTIONS, "{told}", {"told": told, "found": found})
         return self
 
-    def between(self, sound: Mapping[str, Any]) -> Iterable[Finding]:
+    def between(self, sound: Mapping[str, Any]) -> Iterable[Note]:
         """Yield contradictions between values by key."""
         return ()
 
@@ -150,7 +150,7 @@ def _of_another_unit(key: str, value: Any) -> str:
     )
 
 
-def _contradictions(parts: Iterable[tuple[Any, Any]], path: tuple[str | int, ...] = ()) -> Iterator[Finding]:
+def _contradictions(parts: Iterable[tuple[Any, Any]], path: tuple[str | int, ...] = ()) -> Iterator[Note]:
     """Those of all sections among some values by their keys, and of the sections in these."""
     for key, part in parts:
         here = (*path, key)
@@ -180,7 +180,7 @@ class JointVector(Section):
         turn = math.radians if self.unit == "deg" else float
         return np.array([turn(value) if letter == "R" else float(value) for value, letter in pairs])
 
-    def miscounted(self, joint_types: str, *path: str) -> Iterator[Finding]:
+    def miscounted(self, joint_types: str, *path: str) -> Iterator[Note]:
         """Readings too many or too few for the joints of a robot, this vector being at a path."""
         if len(self.joints) != len(joint_types):
             what = f"{len(self.joints)} values for {len(joint_types)} joints ({joint_types})"

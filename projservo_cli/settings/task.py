@@ -22,8 +22,8 @@ from projservo_cli.settings.features import Feature, Name, Pair
 from projservo_cli.settings.sections import (
     ByView,
     Count,
-    Finding,
     JointVector,
+    Note,
     NotNegative,
     Number,
     Positive,
@@ -97,7 +97,7 @@ class GoalImages(ByView):
         None, description="joint readings at the goal, from which task.start takes them if it names the file"
     )
 
-    def contradictions(self) -> Iterator[Finding]:
+    def contradictions(self) -> Iterator[Note]:
         """Yield images of no camera, and keys that are neither names of cameras nor of deviations."""
         yield from super().contradictions()
         if not self.view:
@@ -165,7 +165,7 @@ class DisplacedAlong(Section):
         description="mean motion of the markers in the image in which they move most; below 0 the other way",
     )
 
-    def contradictions(self) -> Iterator[Finding]:
+    def contradictions(self) -> Iterator[Note]:
         """No amount, both, or none to speak of."""
         kinds = self.given("by_m", "by_px")
         if len(kinds) != 1:
@@ -217,7 +217,7 @@ class Goal(Section):
         """Whether it is the start, displaced."""
         return self.displaced is not None and not self.given("joints", "roll_deg", "images")
 
-    def contradictions(self) -> Iterator[Finding]:
+    def contradictions(self) -> Iterator[Note]:
         """No goal, or several."""
         kinds = self.given("joints", "roll_deg", "images")
         if len(kinds) != 1 and not self.of_start:
@@ -254,7 +254,7 @@ class TaskStep(Section):
         None, description="of a motion, such as one into contact; null: trajectory.duration_s"
     )
 
-    def contradictions(self) -> Iterator[Finding]:
+    def contradictions(self) -> Iterator[Note]:
         """No kind of step, or several."""
         if len(self.given(*_KINDS_OF_STEPS)) != 1:
             yield (), f"give exactly one of {', '.join(_KINDS_OF_STEPS)}"
@@ -352,7 +352,7 @@ class TaskSettings(Section):
         incidences = self.goals[before[-1]].incidences if before else ()
         return Goal(displaced=self.steps[k].retreat, incidences=incidences)
 
-    def contradictions(self) -> Iterator[Finding]:
+    def contradictions(self) -> Iterator[Note]:
         """An offset from nowhere, steps to unknown goals, and without a motion."""
         if self.start == CURRENT and self.start_offset is not None:
             yield ("start_offset",), "is that of joints: leave it out with start: current"
@@ -385,7 +385,7 @@ class KeptOut(ByView):
         description="whether the obstacle may occlude markers; those of the face stay outside in all images",
     )
 
-    def contradictions(self) -> Iterator[Finding]:
+    def contradictions(self) -> Iterator[Note]:
         """No polygon, or one that is none."""
         yield from super().contradictions()
         if not self.drawn:

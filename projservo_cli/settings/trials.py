@@ -7,8 +7,8 @@ from pydantic import AfterValidator, Field, StrictBool, StrictInt, StringConstra
 
 from projservo_cli.settings.sections import (
     Count,
-    Finding,
     JointVector,
+    Note,
     NotNegative,
     Number,
     Positive,
@@ -115,7 +115,7 @@ class CalibrationSettings(Section):
         description="cameras that moved since, each fitted again, in this order, as calibrate --refit does",
     )
 
-    def contradictions(self) -> Iterator[Finding]:
+    def contradictions(self) -> Iterator[Note]:
         """Yield keys of another method."""
         if self.refits and self.method != "bundle_adjustment":
             yield ("refits",), f"belong to the method bundle_adjustment, not to {self.method}"

@@ -1,16 +1,20 @@
 """Doctor: look at robot and cameras before anything is recorded, and move each joint a little."""
 
+import math
 import time
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from projservo_cli import words
 from projservo_cli.calibration.refit import view_errors
 from projservo_cli.detection import DICTIONARY, finder_of
+from projservo_cli.findings import LIMITS, NOTE, REFUSES, Finding, Subject, usable
 from projservo_cli.hardware.camera_robot import CameraRobot, View
-from projservo_cli.hardware.checks_at_rest import FAULT, FINE, WARNING, Finding, RobotAtRest, findings_at_rest
+from projservo_cli.hardware.checks_at_rest import RobotAtRest, findings_at_rest
 from projservo_cli.hardware.checks_in_motion import Strokes, findings_of, reach_of, strokes
 from projservo_cli.hardware.video_cameras import VideoCamera
 from projservo_cli.image_size import ImageSize, image_corners, image_sizes
@@ -25,11 +29,10 @@ from projservo_cli.robots.pacing import Steered
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.external_robot import plugin_robot
 from projservo_cli.stages.stage_inputs import OwnRobot, PreflightInputs
-from projservo_cli.words import line, setup_of
+from projservo_cli.words.table import Setup
 
 # Time of observation of a robot at rest, s, and minimum number of readings.
 _LOOK_S, _MIN_LOOKS = 1.5, 8
-_CALIBRATION = "calibration"  # subject of the finding of a comparison with one
 
 
 class Checked(NamedTuple):
@@ -40,17 +43,24 @@ class Checked(NamedTuple):
     moved: tuple[Strokes, ...]  # of the joints that were moved
     refit: tuple[str, RefitPoses] | None = None  # camera that moved, and poses to fit it again from
 
+    setup: Setup = Setup()  # the arm and its cameras
+
     @property
     def works(self) -> bool:
         """Whether nothing stands against a recording."""
-        return all(finding.level != FAULT for finding in self.findings)
+        return usable(self.findings)
+
+    @property
+    def rows(self) -> list[dict[str, Any]]:
+        """The findings as rows of a table and as data."""
+        return [words.row(one, self.setup) | one.plain() for one in self.findings]
 
     @property
     def refuted(self) -> str | None:
         """Reason why the calibration holds no more, empty where it does; None where it was not compared."""
-        for finding in self.findings:
-            if finding.where == _CALIBRATION and finding.level != WARNING:
-                return finding.text if finding.level == FAULT else ""
+        for one in self.findings:
+            if one.code in ("agrees", "refuted", "refuted_camera"):
+                return "" if one.code == "agrees" else words.sentence(one, self.setup)
         return None
 
 
@@ -86,20 +96,18 @@ def check(
                 found = calibration_finding(calibration, at_rest, robot.image_size, inputs.lengths)
                 found, mend = with_refit(found, calibration, at_rest, robot.image_size)
                 findings.append(found)
-            works = all(finding.level != FAULT for finding in findings)
-            if confirmed is not None and not works:
-                findings.append(
-                    Finding(WARNING, "joints", "were not moved: something above is a fault", "mend it first")
-                )
+            if confirmed is not None and not usable(findings):
+                findings.append(Finding("not_moved", LIMITS))
             elif confirmed is not None and confirmed(reach_of(joints.types)):
                 findings += _move_joints(robot, moved, progress)
-                findings += findings_of(moved, at_rest.marker, robot.view, inputs.mount)
+                findings += findings_of(moved, at_rest.marker, robot.view)
     except (InputError, WorkFailed) as error:
         if isinstance(error, InputError) and at_rest is None:
             raise
-        what, _, remedy = str(error).partition(": look ")
-        findings.append(Finding(FAULT, "robot and cameras", what, f"look {remedy}" if remedy else ""))
-    return Checked(tuple(findings), at_rest, tuple(moved), mend)
+        told = (Finding("told", REFUSES, Subject(name=str(error))),)
+        findings += (error.findings if isinstance(error, WorkFailed) else ()) or told
+    setup = Setup(inputs.mount, robot.view, len(joints.types))
+    return Checked(tuple(findings), at_rest, tuple(moved), mend, setup)
 
 
 def _move_joints(robot: PluginRobot, moved: list[Strokes], progress: Progress) -> Iterator[Finding]:
@@ -108,9 +116,8 @@ def _move_joints(robot: PluginRobot, moved: list[Strokes], progress: Progress) -
     for joint in range(joints):
         trial = strokes(steered, joint)
         progress("move", joint + 1, joints)
-        if isinstance(trial, str):
-            what, _, remedy = trial.partition(": ")
-            yield Finding(WARNING, f"joint {joint + 1}", what, remedy)
+        if isinstance(trial, Finding):
+            yield trial
         else:
             moved.append(trial)
 
@@ -161,35 +168,29 @@ def calibration_finding(
     lengths : (f, f) between the markers of the face, m, NaN if unknown.
     """
     if not calibration.usable or not calibration.has_covariance:
-        return Finding(WARNING, _CALIBRATION, "is not usable", "record and calibrate again")
+        return Finding("unusable_calibration", LIMITS)
     known = image_size or [view.frame.grey.shape[::-1] for view in at_rest.views] or None
     size = image_sizes(known, calibration.view)
     marker = np.array(at_rest.marker, dtype=np.int64)
     if not np.isfinite(at_rest.s[:, np.isin(marker, calibration.marker)]).any():
-        return Finding(WARNING, _CALIBRATION, "was not compared: no marker of it is seen", "show the tags")
+        return Finding("uncompared", LIMITS)
     if fault := detected_fault(calibration, at_rest.q, marker, at_rest.s, size):
-        return Finding(
-            FAULT,
-            _CALIBRATION,
-            line(fault, setup_of(calibration)),
-            "put that back, or record and calibrate again",
-        )
+        return Finding("refuted", REFUSES, others=(fault,))
     images = at_known_markers(calibration, marker, at_rest.s)
     mm = resting_error_mm(calibration, at_rest.q, at_rest.face, lengths, images)
-    within = "" if mm is None else f", which show the tool within {mm:.2g} mm of where its joints put it"
-    return Finding(FINE, _CALIBRATION, f"agrees with the images{within}")
+    return Finding("agrees", NOTE, amount=math.nan if mm is None else 1e-3 * mm, unit="m")
 
 
 def with_refit(
     finding: Finding, calibration: Calibration, at_rest: RobotAtRest, image_size: ImageSize | None
 ) -> tuple[Finding, tuple[str, RefitPoses] | None]:
     """Add to a fault how far each view is off; where one camera alone is, poses to fit it again from."""
-    if finding.level != FAULT or len(at_rest.s) != len(calibration.view):
+    if finding.severity != REFUSES or len(at_rest.s) != len(calibration.view):
         return finding, None
     marker = np.array(at_rest.marker, dtype=np.int64)
     look = Observation(np.zeros(1, np.int64), marker, at_rest.q[None], at_rest.s[None], view=calibration.view)
     views = [one for one in view_errors(calibration, look) if np.isfinite(one.off_px)]
-    finding = finding._replace(text=f"{finding.text}; {', '.join(one.text for one in views)}")
+    finding = replace(finding, others=(*finding.others, *(one.finding for one in views)))
     moved = [one.view for one in views if one.disagrees]
     # A joint that slipped, a tag that moved and exchanged cameras show in other views too, if there are any.
     if len(moved) != 1 or len(views) < len(calibration.view):
@@ -202,8 +203,8 @@ def with_refit(
         poses = refit_poses(calibration, v, region, np.random.default_rng(0))
     except WorkFailed:
         return finding, None
-    again = (
-        f"put the {moved[0]} camera back, or fit it again from {len(poses.q)} poses, after which it errs by "
-        f"{poses.error_px:.2g} px ({poses.before_px:.2g} px before it moved)"
+    subject = replace(finding.subject, views=(moved[0],), poses=tuple(range(1, len(poses.q) + 1)))
+    again = replace(
+        finding, code="refuted_camera", subject=subject, amount=poses.error_px, limit=poses.before_px
     )
-    return finding._replace(remedy=again), (moved[0], poses)
+    return replace(again, unit="px"), (moved[0], poses)

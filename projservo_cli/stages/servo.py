@@ -76,7 +76,7 @@ from projservo_cli.task.incidences import (
     whole_pose,
 )
 from projservo_cli.task.target import TaskImages, followed
-from projservo_cli.words import line, order_advice, text
+from projservo_cli.words import line, lines, order_advice, text
 from projservo_cli.words.runs import VERDICTS, arrived
 from projservo_cli.words.table import Setup
 
@@ -232,7 +232,7 @@ class LawRun:
         """
         unseen = driven.unseen(seeing, held=seeing > 1)
         if unseen and not self.blind:
-            remarks = "; ".join([line(unseen, self.setup), *driven.robot.remarks()])
+            remarks = "; ".join([line(unseen, self.setup), *lines(driven.robot.remarks())])
             raise WorkFailed(
                 f"{what} {remarks}: uncover {all_of(driven.robot.view)} and look at the light, or move the "
                 "arm by hand to where they see the tags; --blind (blind=True) drives it without images"

@@ -9,11 +9,13 @@ from itertools import groupby
 from typing import Any
 
 from projservo_cli.findings import DEVIATIONS, LIMITS, NOTE, REFUSES, Finding, columns, first, usable
-from projservo_cli.records import TOOL as TOOL
-from projservo_cli.records import Calibration
+from projservo_cli.records import Calibration, WorkFailed
 from projservo_cli.words.table import ROWS, Setup
 from projservo_cli.words.values import Told, quantity
 
+_SETUP = Setup()
+# Severities as levels of a table on a robot.
+_LEVELS = {NOTE: "fine", LIMITS: "warning", REFUSES: "fault"}
 # Maximum number of deviations from the model in advice.
 _MAX_NAMED = 3
 _CAUSES = ("other_mount", "images_before_readings", "images_after_readings", "joint_type", "standing_joint")
@@ -33,15 +35,28 @@ def sentence(one: Finding, setup: Setup) -> str:
     return _sentence([one], setup)
 
 
-def line(one: Finding, setup: Setup) -> str:
+def line(one: Finding, setup: Setup = _SETUP) -> str:
     """Return the sentence on a finding and its remedy."""
     return _line([one], setup)
 
 
-def lines(findings: Iterable[Finding], setup: Setup) -> tuple[str, ...]:
+def lines(findings: Iterable[Finding], setup: Setup = _SETUP) -> tuple[str, ...]:
     """Return a line on each finding, one for all joints that are alike."""
     groups = groupby(findings, key=lambda one: one.code if one.code in _TOGETHER else id(one))
     return tuple(_line(list(group), setup) for _, group in groups)
+
+
+def row(one: Finding, setup: Setup) -> dict[str, str]:
+    """Return a finding as a row of a table: its level, what it is about, what is found, and the remedy."""
+    told = Told([one], setup)
+    where, remedy = told.text("where") or "robot and cameras", told.text("remedy")
+    return {"level": _LEVELS[one.severity], "where": where, "text": sentence(one, setup), "remedy": remedy}
+
+
+def failed(findings: Iterable[Finding], setup: Setup = _SETUP, begin: str = "") -> WorkFailed:
+    """Return the error that findings are, told after a beginning such as ``teach: ``."""
+    found = tuple(findings)
+    return WorkFailed(begin + text(found, setup), findings=found)
 
 
 def text(findings: Iterable[Finding], setup: Setup) -> str:

@@ -6,6 +6,7 @@ from typing import NamedTuple
 class Row(NamedTuple):
     """Words for a code."""
 
-    limit: str  # after "limited by"; empty where predictions are as exact
     sentence: str
     remedy: str = ""
+    limit: str = ""  # after "limited by"; empty where predictions are as exact
+    where: str = ""  # that it is about, in a table on a robot; empty for robot and cameras

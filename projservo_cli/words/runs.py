@@ -66,76 +66,64 @@ _REPLANNED = {
     "goal_hidden": "the face is hidden at the end of the path",
 }
 REASONS = {
-    "converged": Row("", "{name} {amount} is within {limit}"),
-    "no_progress": Row("", "no progress at an {name} of {amount}: {causes}"),
-    "max_steps": Row("", "no step left; {name} {amount} was still changing"),
-    "error_grew": Row("", "{name} {amount} is more than {part} times that at first, {limit}"),
-    "face_left": Row("", "the face is {amount} from the cameras, over {part} times the {limit} at first"),
-    "not_finite": Row("", "the command at step {count} is not finite"),
-    "out_of_view": Row("", "a face marker left an image at step {count}"),
-    "behind_camera": Row("", "a face marker passed behind a camera at step {count}"),
-    "markers_lost": Row("", "the law could not measure the face at step {count}: {causes}"),
-    "marker_unseen": Row("", "a marker was not seen{for_long}"),
+    "converged": Row("{name} {amount} is within {limit}"),
+    "no_progress": Row("no progress at an {name} of {amount}: {causes}"),
+    "max_steps": Row("no step left; {name} {amount} was still changing"),
+    "error_grew": Row("{name} {amount} is more than {part} times that at first, {limit}"),
+    "face_left": Row("the face is {amount} from the cameras, over {part} times the {limit} at first"),
+    "not_finite": Row("the command at step {count} is not finite"),
+    "out_of_view": Row("a face marker left an image at step {count}"),
+    "behind_camera": Row("a face marker passed behind a camera at step {count}"),
+    "markers_lost": Row("the law could not measure the face at step {count}: {causes}"),
+    "marker_unseen": Row("a marker was not seen{for_long}"),
     "marker_flickers": Row(
-        "",
         "a marker was not seen in {count} of the last {total} periods, with the robot held meanwhile",
         "look at light and exposure there, or at what covers it",
     ),
-    "joint_limit": Row("", "{joints} stands at its limit, {amount}, and the task would take it beyond"),
-    "singular": Row("", "the joint motion was not unique at step {count}: the robot is near a singularity"),
-    "remaining": Row("", "{left}an {name} of {amount} is left"),
-    "vague_markers": Row("", "markers there state {amount} times the noise", "look what covers them"),
+    "joint_limit": Row("{joints} stands at its limit, {amount}, and the task would take it beyond"),
+    "singular": Row("the joint motion was not unique at step {count}: the robot is near a singularity"),
+    "remaining": Row("{left}an {name} of {amount} is left"),
+    "vague_markers": Row("markers there state {amount} times the noise", "look what covers them"),
     "face_apart": Row(
-        "",
         "the face itself is seen {amount} off ({limit} by noise): it moved on the tool since the goal was "
         "taught",
         "teach it again",
     ),
-    "blind_camera": Row(
-        "", "the {view} camera has shown no marker of the face since step {count}", "check it"
-    ),
-    "replanned": Row("", "replanned at step {count} ({because})"),
-    "replanned_in_vain": Row("", "replanned at step {count} ({because}) in vain"),
-    "passed_over": Row("", "passed over where the face is lost to step {count}"),
-    "local_minimum": Row("", "the law asks for no motion there, a local minimum"),
+    "blind_camera": Row("the {view} camera has shown no marker of the face since step {count}", "check it"),
+    "replanned": Row("replanned at step {count} ({because})"),
+    "replanned_in_vain": Row("replanned at step {count} ({because}) in vain"),
+    "passed_over": Row("passed over where the face is lost to step {count}"),
+    "local_minimum": Row("the law asks for no motion there, a local minimum"),
     "slow_commands": Row(
-        "",
         "commands are too slow, {percent} % of the way in a period",
         "raise plant.speed_scale, the limits of joint speeds, control.period_s, or stop.stall_periods",
     ),
     "coarse_motion": Row(
-        "",
         "set-points moved by no more than {amount}: backlash, coarse set-points or coarse readings hide the "
-        "rest",
+        "rest"
     ),
     "joint_stays": Row(
-        "",
         "{joints} stands at {amount}, {limit} off its set-point",
         "look whether it is blocked, braked or in a protective stop, or raise "
         "plant.max_steady_state_error_deg or plant.max_relative_target_deg",
     ),
     "small_steps": Row(
-        "",
         "set-points of {joints} moved by {amount}, its readings by {limit}: it does not follow such small "
-        "steps; coarse set-points, or friction",
+        "steps; coarse set-points, or friction"
     ),
     "no_gain": Row(
-        "",
         "set-points of {joints} moved by {amount}, its readings by {limit}, and images show no gain: "
-        "backlash, or coarse set-points",
+        "backlash, or coarse set-points"
     ),
     "pressed": Row(
-        "",
-        "the tool is pressed with {amount}, beyond the {limit} of stop.max_force_n",
-        "see what it touches",
+        "the tool is pressed with {amount}, beyond the {limit} of stop.max_force_n", "see what it touches"
     ),
     "moved_object": Row(
-        "",
         "the object {name}, markers {ends}, has moved since the motion was planned, by {amount} in the "
         "{view} image ({limit} at most)",
         "let it lie still, and plan again",
     ),
-    "unseen_markers": Row("", "{dark} of the calibration"),
+    "unseen_markers": Row("{dark} of the calibration"),
 }
 
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 from projservo_cli.findings import Finding
 from projservo_cli.records import TOOL, VIEWS, WORLD
-from projservo_cli.words import calibrations, monitoring, plans, runs
+from projservo_cli.words import calibrations, monitoring, plans, robots, runs
 from projservo_cli.words.rows import Row
 
 ROWS: dict[str, Row] = (
@@ -15,6 +15,7 @@ ROWS: dict[str, Row] = (
     | plans.PLANS
     | monitoring.FAULTS
     | runs.REASONS
+    | robots.ROBOTS
 )
 _ON_THE_TOOL = calibrations.ON_THE_TOOL | monitoring.ON_THE_TOOL
 

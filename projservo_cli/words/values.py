@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 import numpy as np
 
 from projservo_cli.findings import NOTE, Finding, Subject
-from projservo_cli.records import LIMITS_MISSING, TOOL
+from projservo_cli.records import CORNERS, LIMITS_MISSING, TOOL
 from projservo_cli.words.runs import because
 from projservo_cli.words.table import Setup, row_of
 
@@ -18,6 +18,8 @@ _UNITS = {
     "m": (1e3, " mm"),
     "s": (1.0, " s"),
     "N": (1.0, " N"),
+    "V": (1.0, " V"),
+    "°C": (1.0, " °C"),
     "1": (1.0, ""),
     "": (1.0, ""),
 }
@@ -220,6 +222,30 @@ def _enough_see(told: Told) -> str:
     return {1: "the camera sees", 2: "both cameras see"}.get(cameras, f"all {cameras} cameras see")
 
 
+def servo_name(subject: Subject) -> str:
+    """Name a servo by its joint."""
+    return f"{numbered('joint', subject.joints)} ({subject.name})" if subject.joints else subject.name
+
+
+def _by_views(told: Told, one: str, two: str, more: str) -> str:
+    """Choose words by the number of the cameras."""
+    return {1: one, 2: two}.get(len(told.setup.view), more)
+
+
+def _play(one: Finding) -> str:
+    """Tell the hysteresis, sag or backlash of a joint, to a tenth; that is hidden if it has no amount."""
+    factor, unit = _UNITS[one.unit]
+    size = "hidden by gravity" if math.isnan(one.amount) else f"{round(factor * one.amount, 1):g}{unit}"
+    return f"{one.subject.name} {size}"
+
+
+def _within(told: Told) -> str:
+    """Say how far images and joints agree on the tool, where its size is known."""
+    if math.isnan(told.one.amount):
+        return ""
+    return f", which show the tool within {quantity(told.one.amount, 'm', 2)} of where its joints put it"
+
+
 VALUES: dict[str, Callable[[Told], object]] = {
     # Of the subject.
     "of": lambda told: told.subject.joints,
@@ -320,6 +346,42 @@ VALUES: dict[str, Callable[[Told], object]] = {
     "left": _left,
     "because": lambda told: because(told.subject.name),
     "dark": _dark,
+    # Of robots and cameras.
+    "tags": lambda told: numbered("tag", sorted({number // CORNERS for number in told.subject.markers})),
+    "are": lambda told: "are" if len({number // CORNERS for number in told.subject.markers}) > 1 else "is",
+    "rate": lambda told: "fewer than 3" if math.isnan(told.one.amount) else f"{told.one.amount:.1f}",
+    "stamped": lambda told: told.subject.name or "when they arrive",
+    "frame_ms": lambda told: f"{1e3 / told.one.limit:.0f}",
+    "in_ms": lambda told: f"{1e3 * told.one.amount:.0f}",
+    "of_name": lambda told: told.rest.subject.name,
+    "instead": lambda told: "" if math.isnan(told.one.amount) else f", it has {told.one.amount:.3g}",
+    "devices": lambda told: (
+        ", ".join(one.subject.name for one in told.one.others) or "none: look at the cable"
+    ),
+    "other_device": lambda told: told.rest.subject.name if told.one.others else "another device",
+    "each_frame": lambda told: "each of its frames " if told.subject.views else "",
+    "any_image": lambda told: "it" if math.isnan(told.one.amount) else f"any of {told['count']} images",
+    "as_board": lambda told: told.one.others[-1].subject.name,
+    "two": lambda told: "both" if len(told.setup.view) == 2 else "two",
+    "white": lambda told: f"{told.rest.amount:.1%}",
+    "blur": lambda told: "".join(f", edges blurred by {one.amount:.1f} px" for one in told.one.others[1:]),
+    "widths": lambda told: ", ".join(f"{one.subject.tag} ({one.amount:.0f} px)" for one in told.one.others),
+    "corners": lambda told: "" if math.isnan(told.one.amount) else f"; corners to {told.one.amount:.2g} px",
+    "share": lambda told: _by_views(told, "shows", "share", "two or more show"),
+    "lack": lambda told: _by_views(told, "does not show", "do not both show", "fewer than two show"),
+    "images": lambda told: _by_views(told, "image", "both images", "images"),
+    "towards": lambda told: _by_views(told, "the camera", "both cameras", "the cameras"),
+    "it_or_them": lambda told: _by_views(told, "it", "them", "them"),
+    "readings": lambda told: ", ".join(quantity(one.amount, one.unit, 4) for one in told.one.others),
+    "amounts": lambda told: ", ".join(map(_play, told.one.others)),
+    "servo": lambda told: servo_name(told.subject),
+    "servos": lambda told: joined(servo_name(one.subject) for one in told.one.others),
+    "after": lambda told: f", after {told['part']}" if told.one.others else "",
+    "carried": lambda told: "cameras" if told.setup.mount == TOOL else "tags",
+    "of_poses": lambda told: len(told.subject.poses),
+    "within": _within,
+    "found": lambda told: "; ".join(told.others("sentence")),
+    "views_off": lambda told: "".join(f"; {said}" for said in told.others("sentence")),
     # Of arms of one joint, and of several.
     "elsewhere": lambda told: "markers farther from its axis" if told.alone else "trials of every joint",
     "by_itself": lambda told: "" if told.alone else f" in which {told['it']} moves alone",

@@ -7,6 +7,7 @@ import numpy as np
 from projservo_cli.config import load_config
 from projservo_cli.config.inputs import recording_inputs
 from projservo_cli.config.whole import truth_of
+from projservo_cli.findings import Finding
 from projservo_cli.hardware import checks_in_motion
 from projservo_cli.robots.contract import PluginRobot, at_rest_after
 from projservo_cli.robots.pacing import Steered
@@ -111,5 +112,5 @@ def findings(faults, moving=range(5), **given):
     with at_rest_after(foreign):
         steered = Steered(foreign)
         moved = [checks_in_motion.strokes(steered, joint) for joint in moving]
-    sound = [one for one in moved if not isinstance(one, str)]
+    sound = [one for one in moved if not isinstance(one, Finding)]
     return [*checks_in_motion.findings_of(sound, numbers)], moved

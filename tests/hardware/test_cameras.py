@@ -12,12 +12,14 @@ import pytest
 pytest.importorskip("cv2")
 
 from projservo_cli.detection import TagFinder
+from projservo_cli.findings import Subject
 from projservo_cli.hardware import video_cameras
 from projservo_cli.hardware.camera_robot import CameraRobot
 from projservo_cli.hardware.video_cameras import VideoCamera
 from projservo_cli.records import WorkFailed
 from projservo_cli.settings.cameras import Cameras as Stereo
 from projservo_cli.settings.cameras import Source
+from projservo_cli.words import line
 from tests.hardware.streams import Stream, picture
 
 SEEN = picture()
@@ -95,26 +97,28 @@ def test_a_missing_or_forbidden_or_metadata_device_is_named_with_the_right_one(m
 
     monkeypatch.setattr("fcntl.ioctl", ioctl)
     monkeypatch.setattr(video_cameras, "_nodes", lambda: nodes)
-    assert video_cameras._wrong_device(nodes[0]) == ""
-    assert video_cameras._wrong_device(nodes[1]) == (
-        f"{nodes[1]} gives no pictures: it is the second node of a webcam, for metadata: take {nodes[0]}"
-    )
+    left = Subject(views=("left",))
+    assert video_cameras._wrong_device(nodes[0], left) is None
+    second = video_cameras._wrong_device(nodes[1], left)
+    assert second.code == "second_node"
+    assert line(second).endswith(f"; take {nodes[0]}")
     monkeypatch.setattr("os.access", lambda *_: False)
-    assert "sudo usermod -aG video $USER" in video_cameras._wrong_device(nodes[0])
+    assert video_cameras._wrong_device(nodes[0], left).code == "unreadable_device"
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="/proc tells who has it")
 def test_a_camera_that_another_program_has_is_named_with_that_program(tmp_path):
     device = tmp_path / "video0"
     device.touch()
-    assert video_cameras._holder(device) == ""
+    assert video_cameras._holder(device, Subject()) is None
     code = f"import time; f = open({str(device)!r}); print('open', flush=True); time.sleep(60)"
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as other:
         assert other.stdout.readline()
-        told = video_cameras._holder(device)
+        told = video_cameras._holder(device, Subject())
         other.kill()
-    assert told.startswith(f"{device} is in use by python")
-    assert f"(process {other.pid}): close that" in told
+    (process,) = told.others
+    assert (told.code, told.subject.name, process.amount) == ("held_device", str(device), other.pid)
+    assert process.subject.name.startswith("python")
 
 
 class Arm:

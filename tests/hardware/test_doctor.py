@@ -16,11 +16,12 @@ from projservo_cli.calibration import predict
 from projservo_cli.config import load_config
 from projservo_cli.config.inputs import calibration_inputs
 from projservo_cli.files import working_in
-from projservo_cli.hardware.checks_at_rest import FAULT, FINE, Finding
+from projservo_cli.findings import NOTE, REFUSES, Finding, Subject, first
 from projservo_cli.report.live_page import LivePage
 from projservo_cli.stages import calibrate
 from projservo_cli.stages.doctor import Checked, calibration_finding, with_refit
 from projservo_cli.store.run_file import load
+from projservo_cli.words import line
 from tests.conftest import ROOT
 from tests.hardware.arms_in_motion import Faults, Rail, findings
 from tests.hardware.streams import Stream, picture
@@ -50,7 +51,7 @@ control: {{joint_speed_limit_deg_s: 60}}
 
 @pytest.fixture
 def doctor(projservo, tmp_path, monkeypatch):
-    """Function that checks an arm before two drawn images; the answer, and findings by level."""
+    """Function that checks an arm before two drawn images; the answer, and findings by level and code."""
     monkeypatch.chdir(tmp_path)
     streams = []
 
@@ -63,11 +64,9 @@ def doctor(projservo, tmp_path, monkeypatch):
         answer = projservo("doctor", "-c", "arm.yaml", "--json", *sets)
         told = json.loads(answer.out)["findings"]
         assert not re.search(r"\bnan\b", answer.out)
+        levels = "fault", "warning", "fine"
         return answer, {
-            level: [
-                f"{one['where']}: {one['text']}: {one['remedy']}" for one in told if one["level"] == level
-            ]
-            for level in ("fault", "warning", "fine")
+            level: {one["code"]: one for one in told if one["level"] == level} for level in levels
         }
 
     yield check
@@ -77,17 +76,15 @@ def doctor(projservo, tmp_path, monkeypatch):
 
 def test_a_sound_set_up_is_ready_and_shown_on_a_page(doctor, tmp_path):
     answer, found = doctor(LEFT, picture(at=(50.0, 90.0), numbers=(0, 1, 2), side=50.0, step=70.0))
-    warned = [
-        one for one in found["warning"] if "directions" not in one
-    ]  # both pictures are drawn from ahead
-    assert warned == []
-    assert "left image: tags 0 (50 px), 1 (50 px), 2 (50 px); corners to 0.0" in "\n".join(found["fine"])
-    assert any("supply, V 12.1" in one for one in found["fine"])
-    assert any("frames a second, stamped when they arrive" in one for one in found["fine"])
+    assert found["warning"].keys() <= {"alike_views"}  # both pictures are drawn from ahead
+    fine = {code: f"{one['where']}: {one['text']}" for code, one in found["fine"].items()}
+    assert fine["tags_seen"].startswith("right image: tags 0 (50 px), 1 (50 px), 2 (50 px); corners to 0.0")
+    assert fine["health"] == "arm: supply, V 12.1"
+    assert fine["camera_rate"].endswith("frames a second, stamped when they arrive")
     page = (tmp_path / "preflight.html").read_text(encoding="utf-8")
     assert page.count("data:image/jpeg;base64,") == 2
     assert html.escape("share 12 of 12 markers") in page
-    assert "directions" in found["fault"][0]
+    assert found["fault"].keys() == {"alike_views"}
     assert answer.code == 1
 
 
@@ -95,47 +92,45 @@ _OTHER = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100)
 
 
 @pytest.mark.parametrize(
-    ("left", "right", "level", "words"),
+    ("left", "right", "level", "told"),
     [
         (
             picture(at=(30.0, 80.0), numbers=(0, 1, 0), side=50.0),
             picture(numbers=(0, 1), at=(60.0, 80.0), tags=_OTHER),
             "fault",
-            (
-                "left image: tag 0 is there twice: a number must be unique: print another one",
-                "right image: 2 tags are of 5X5_50, none of 4X4_50: set markers.dictionary: 5X5_50",
-            ),
+            {
+                "repeated_tag": {"views": ["left"], "tag": 0},
+                "other_dictionary": {"views": ["right"], "name": "5X5_50"},
+            },
         ),
         (
             LEFT[:, ::-1],
             LEFT,
             "fault",
-            ("the left camera's image is mirrored: it shows no tag, its mirror image tags 0, 1, 2; switch",),
+            {"mirrored_image": {"views": ["left"], "markers": [0, 4, 8]}},
         ),
         (
             picture(at=(60.0, 80.0), numbers=(7, 8)),
             np.full((240, 320), 2, np.uint8),
             "fault",
-            (
-                "left image: tags 7, 8 are there, and markers has none of them: name the corners",
-                "right camera: its image is black: take the cap off",
-            ),
+            {
+                "unknown_tags": {"views": ["left"], "markers": [28, 32]},
+                "black_image": {"views": ["right"]},
+            },
         ),
         (
             picture(at=(60.0, 80.0), numbers=(0, 1, 2), side=19.0),
             picture(numbers=(0, 1), at=(60.0, 80.0), blur=3.5),
             "warning",
-            (
-                " px a cell (4 at least): print larger tags, move the camera nearer",
-                "right camera: its image is blurred by",
-            ),
+            {"small_tag": {"views": ["left"], "tag": 2}, "blurred_image": {"views": ["right"]}},
         ),
     ],
 )
-def test_a_mistake_with_tags_or_light_is_named_with_its_remedy(doctor, left, right, level, words):
+def test_a_mistake_with_tags_or_light_is_named_with_its_remedy(doctor, left, right, level, told):
     _, found = doctor(left, right)
-    for text in words:
-        assert [one for one in found[level] if text in one], found
+    for code, subject in told.items():
+        assert found[level][code]["subject"] == subject
+        assert found[level][code]["remedy"]
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="device nodes of Linux")
@@ -202,11 +197,12 @@ def test_a_calibrated_run_tells_what_changed_since(calibrated, change, words):
     lengths = np.array([[0.0, side, diagonal, side], [side, 0.0, side, diagonal]])
     lengths = np.concatenate([lengths, np.roll(lengths, 2, axis=1)])
     finding = calibration_finding(calibrated, seen, (640, 480), lengths)
-    assert words in f"{finding.text}: {finding.remedy}"
-    assert (finding.level == "fine") == (words.startswith("agrees with the images"))
+    text = line(finding)
+    assert words in text
+    assert (finding.severity == NOTE) == (words.startswith("agrees with the images"))
     unknown = calibration_finding(calibrated, seen, (640, 480), np.full((4, 4), np.nan))
-    assert unknown.level == finding.level
-    assert "mm" not in unknown.text
+    assert unknown.severity == finding.severity
+    assert "mm" not in line(unknown)
 
 
 @pytest.mark.parametrize(("views", "slipped"), [(2, False), (2, True), (3, False)])
@@ -220,13 +216,16 @@ def test_a_camera_that_moved_is_named_with_the_poses_that_mend_it(calibrated, vi
     seen = SimpleNamespace(q=q, s=s, marker=calibrated.marker.tolist(), face=(0, 1, 2, 3), views=())
     fault = calibration_finding(calibrated, seen, (640, 480), np.full((4, 4), np.nan))
     finding, mend = with_refit(fault, calibrated, seen, (640, 480))
-    assert finding.text.startswith(f"{fault.text}; the left images are ")
+    fault, *views = finding.others
+    assert fault.code == "images_off"
+    assert [one.subject.views for one in views] == [(name,) for name in calibrated.view]
     assert (mend is None) == slipped
     if mend is not None:
         view, poses = mend
         assert view == "right"
-        assert "the right images are 17 px off (0." in finding.text
-        assert f"put the right camera back, or fit it again from {len(poses.q)} poses" in finding.remedy
+        off = views[1]
+        assert (off.amount, off.limit < 1.0) == (pytest.approx(17.0, abs=0.5), True)
+        assert f"put the right camera back, or fit it again from {len(poses.q)} poses" in line(finding)
         assert poses.before_px < poses.error_px <= 1.5 * poses.before_px
 
 
@@ -251,34 +250,29 @@ def _scaled(s, factor):
 
 def test_motions_of_a_sound_arm_tell_latency_hysteresis_and_backlash():
     found, moved = findings(Faults(latency_s=(0.12, 0.06), hysteresis_deg=0.6, backlash_deg=0.4))
-    assert [one.level for one in found] == ["fine"] * len(found)
-    late = {one.where: float(one.text.split()[1]) for one in found if one.text.startswith("latency")}
-    assert late == {"left camera": pytest.approx(120, abs=5), "right camera": pytest.approx(60, abs=5)}
+    assert {one.severity for one in found} == {NOTE}
+    late = [(one.subject.views, one.amount) for one in found if one.code == "latency"]
+    near = [pytest.approx(seconds, abs=0.005) for seconds in (0.12, 0.06)]
+    assert late == [(("left",), near[0]), (("right",), near[1])]
     for one in found[:5]:
-        hysteresis = float(one.text.split("hysteresis ")[1].split("°")[0])
+        hysteresis, _, backlash = (np.degrees(part.amount) for part in one.others)
         assert hysteresis == pytest.approx(0.6, abs=0.12)
-        assert "backlash 0.3" in one.text or "backlash 0.4" in one.text
+        assert 0.25 < backlash < 0.5
     assert max(np.degrees(np.ptp(one.q)) for one in moved) < 8.0
 
 
 @pytest.mark.parametrize(
-    ("faults", "moving", "where", "words"),
+    ("faults", "moving", "code", "where"),
     [
-        (
-            Faults(link=3),
-            range(5),
-            "joints 4, 5",
-            "no tag moved: the tags sit on the link before joint 4: mount them behind",
-        ),
-        (Faults(loose=3, loose_px=3.0), (0, 2), "tags", "tag 3 moved by"),
-        (Faults(held=1), (1,), "joint 2", "went 0 deg of 3 deg: it is held or too weak: free it"),
+        (Faults(link=3), range(5), "early_link", Subject(joints=(4, 5))),
+        (Faults(loose=3, loose_px=3.0), (0, 2), "loose_tag", Subject(tag=3)),
+        (Faults(held=1), (1,), "held_joint", Subject(joints=(2,))),
     ],
 )
-def test_motions_name_what_a_recording_would_fail_at(faults, moving, where, words):
+def test_motions_name_what_a_recording_would_fail_at(faults, moving, code, where):
     found, _ = findings(faults, moving)
-    (fault,) = (one for one in found if one.level == "fault")
-    assert fault.where == where
-    assert words in f"{fault.text}: {fault.remedy}"
+    fault = first(found, REFUSES)
+    assert (fault.code, fault.subject) == (code, where)
 
 
 RAIL = """\
@@ -325,25 +319,22 @@ def test_a_joint_without_limits_is_a_fault_and_nothing_moves(rail, tmp_path):
     answer, found, asked = rail(limits="{from_data: 0.1}")
     assert (answer.code, asked, Rail.last.sent) == (1, [], [])
     assert (tmp_path / "preflight.html").exists()
-    assert [one["where"] for one in found if (one["level"], one["text"]) == ("fault", "has no limits")] == [
-        "joint 1",
-        "joint 2",
-    ]
-    assert found[-1]["text"] == "were not moved: something above is a fault"
+    faults = [(one["code"], one["where"]) for one in found if one["level"] == "fault"]
+    assert faults == [("joint_without_limits", "joint 1"), ("joint_without_limits", "joint 2")]
+    assert found[-1]["code"] == "not_moved"
 
 
 @pytest.mark.parametrize(
-    ("frozen", "where", "words"),
+    ("frozen", "where", "code"),
     [
-        ("[0, 1]", "joints 1, 2", "turned, and no tag moved: look whether the tags are on this arm"),
-        ("[1]", "right camera", "its tags moved by 0.0 px with the joints (1 at least): look whether"),
+        ("[0, 1]", "joints 1 and 2", "still_tags"),
+        ("[1]", "right camera", "still_image"),
     ],
 )
-def test_a_camera_that_repeats_one_frame_is_named(rail, tmp_path, frozen, where, words):
+def test_a_camera_that_repeats_one_frame_is_named(rail, tmp_path, frozen, where, code):
     answer, found, _ = rail(options=f", options: {{frozen: {frozen}}}")
     (fault,) = (one for one in found if one["level"] == "fault")
-    assert (answer.code, fault["where"]) == (1, where)
-    assert words in f"{fault['text']}: {fault['remedy']}"
+    assert (answer.code, fault["where"], fault["code"]) == (1, where, code)
     assert (frozen == "[1]") == any(one["where"] == "tags" for one in found)
     assert (tmp_path / "preflight.html").exists()
 
@@ -371,7 +362,8 @@ def test_a_run_that_images_contradict_is_marked_unless_another_process_is_at_wor
     assert projservo("calibrate", "-c", ROOT / "configs" / "hobby.yaml", "-o", "out").code == 0
     text = CONFIGURATION.format(left="left.mp4", right="right.mp4", rate=20, options="")
     (tmp_path / "arm.yaml").write_text(text, encoding="utf-8")
-    moved = Finding(FAULT, "calibration", "the left camera was moved", "put it back")
+    camera = Finding("displaced_camera", REFUSES, Subject(views=("left",)), 3.0, unit="px")
+    moved = Finding("refuted", REFUSES, others=(camera,))
 
     def answer_to(finding):
         checked = Checked((finding,), None, ())
@@ -379,11 +371,11 @@ def test_a_run_that_images_contradict_is_marked_unless_another_process_is_at_wor
         return projservo("doctor", "out", "-c", "arm.yaml")
 
     assert answer_to(moved).code == 1
-    assert load("out").refuted == "the left camera was moved"
+    assert load("out").refuted == "the left camera was moved, by 3 px"
     with working_in(tmp_path / "out"):
-        answer = answer_to(Finding(FINE, "calibration", "agrees with the images"))
+        answer = answer_to(Finding("agrees", NOTE))
     assert answer.code == 2
     assert "is at work there" in answer.err
-    assert load("out").refuted == "the left camera was moved"
-    assert answer_to(Finding(FINE, "calibration", "agrees with the images")).code == 0
+    assert load("out").refuted == "the left camera was moved, by 3 px"
+    assert answer_to(Finding("agrees", NOTE)).code == 0
     assert load("out").refuted == ""

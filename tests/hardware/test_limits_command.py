@@ -83,7 +83,7 @@ def test_a_joint_that_was_not_moved_is_named_and_nothing_written(arm, capsys):
     before = arm.file.read_text()
     assert run(["limits", "-c", "arm.yaml"]) == 1
     error = capsys.readouterr().err
-    assert "joint 4 (servo 4) was moved by 3.9° (20° at least)" in error or "was moved by 4.0°" in error
+    assert "joint 4 (servo 4) was moved by 3.96° (20° at least)" in error or "was moved by 4.0°" in error
     assert "torque is off: nothing holds the arm" in error
     assert arm.file.read_text() == before
 

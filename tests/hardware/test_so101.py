@@ -11,6 +11,7 @@ import time
 import numpy as np
 import pytest
 
+from projservo_cli.findings import Subject
 from projservo_cli.hardware import feetech, so101
 from projservo_cli.hardware.so101 import COUNT, MIDDLE, SO101
 from projservo_cli.records import InputError, JointLimits, WorkFailed
@@ -192,23 +193,27 @@ def silent_wire(bus):
 
 
 FAULTS = {
-    "voltage": (lambda bus: bus.servos[2].put(62, 1, 121), r"joint 2 .*12.1 V \(4.0 to 8.0 V\)", 2),
-    "heat": (lambda bus: bus.servos[3].put(63, 1, 75), r"joint 3 .*too hot, 75 °C", 3),
-    "a cable": (silent_wire, r"joint 4 \(servo 4\): no answer any more: it may fall", 4),
-    "supply": (lambda bus: bus.cut_supply(), "no servo answers any more: all joints may fall", 1),
-    "USB": (lambda bus: bus.cut_usb(), "is gone: look at its USB cable", 1),
+    "voltage": (lambda bus: bus.servos[2].put(62, 1, 121), "servo_supply", 2),
+    "heat": (lambda bus: bus.servos[3].put(63, 1, 75), "servo_heat", 3),
+    "a cable": (silent_wire, "silent_servos", 4),
+    "supply": (lambda bus: bus.cut_supply(), "silent_arm", 1),
+    "USB": (lambda bus: bus.cut_usb(), "lost_port", 1),
 }
 
 
 @pytest.mark.parametrize("fault", FAULTS)
 def test_what_fails_is_named_in_time_and_written_to_no_more(opened, fault):
     bus, arm = opened()
-    strike, told, number = FAULTS[fault]
+    strike, code, number = FAULTS[fault]
     drive(arm, np.radians([5.0] * 5), 3)
     strike(bus)
     begun = time.monotonic()
-    with pytest.raises(WorkFailed, match=told):
+    with pytest.raises(WorkFailed) as caught:
         drive(arm, np.radians([5.0] * 5), 100)
+    (found,) = caught.value.findings
+    assert found.code == code
+    if code.startswith("servo"):
+        assert found.subject == Subject(joints=(number,), name=f"servo {number}")
     assert time.monotonic() - begun < 2.0
     written = len(bus.writes)
     with contextlib.suppress(WorkFailed):
@@ -219,7 +224,7 @@ def test_what_fails_is_named_in_time_and_written_to_no_more(opened, fault):
 def test_an_arm_that_presses_against_a_stop_is_named(opened, rig):
     bus = rig(mechanics=Mechanics(stops_deg={0: (-15.0, 15.0)}))
     bus, arm = opened(bus)
-    with pytest.raises(WorkFailed, match=r"joint 1 \(servo 1\): it is overloaded, .* free it from"):
+    with pytest.raises(WorkFailed, match=r"joint 1 \(servo 1\) is overloaded, .*: free it from"):
         drive(arm, np.radians([60.0, 0, 0, 0, 0]), 120)
 
 
