@@ -46,6 +46,7 @@ from projservo_cli.sweeps.design import Design, require_sound
 from projservo_cli.sweeps.engine import Engine
 from projservo_cli.sweeps.folder import Folder, run_sweep
 from projservo_cli.sweeps.statistics import Study
+from projservo_cli.words import sentence
 
 _WITHOUT_TASKS = 20  # default runs of a cell
 _NO_LAW = "law {!r:.40}: expected a name, or a class or function that makes a law"
@@ -105,7 +106,7 @@ def simulate(
         require_radians("q", poses, joints.types)
         for k, pose in enumerate(poses):
             if wrong := joints.limit_passed(pose):
-                raise InputError(f"q: pose {k}: {wrong}: choose another")
+                raise InputError(f"q: pose {k}: {sentence(wrong)}: choose another")
         return calibrating.simulated(trials, poses, seed, progress=listener.progress)
 
 

@@ -273,8 +273,8 @@ class Chain:
         """Record the pending poses first; return whether they are all there."""
         if self.recording.why:
             self.listener.say(f"record: making ({self.recording.why})")
-        if reason := recording_made(self.listener, self.config, self.recording, confirm=self.confirm):
-            self.failed, self.reason = "record", reason
+        if why := recording_made(self.listener, self.config, self.recording, confirm=self.confirm):
+            self.failed, self.reason, self.evidence = "record", str(why), why.findings
             return False
         if self.run.refuted:  # by what the new recording has taken the place of
             save(replace(self.run, refuted=""))
@@ -572,8 +572,8 @@ def pending_recording(config: Config, run: Run, motions: JointList | None, *, fo
     return replace(begun, why=f"what is there was contradicted: {run.refuted}")
 
 
-def recording_made(listener: Listener, config: Config, recording: Any, *, confirm: bool) -> str:
-    """Record the pending poses, and tell how far it is on an interrupt; return the reason of a failure."""
+def recording_made(listener: Listener, config: Config, recording: Any, *, confirm: bool) -> WorkFailed | None:
+    """Record the pending poses, and tell how far it is on an interrupt; return a failure."""
     from projservo_cli.stages.record import record_poses
 
     if recording.pending and confirm:
@@ -588,11 +588,12 @@ def recording_made(listener: Listener, config: Config, recording: Any, *, confir
     try:
         record_poses(recording_inputs(config), recording, progress=progress)
     except WorkFailed as error:
-        return " ".join(str(error).split()).removeprefix("record: ")
+        reason = " ".join(str(error).split()).removeprefix("record: ")
+        return WorkFailed(reason, findings=error.findings)
     except KeyboardInterrupt:
         listener.say(f"{recording.path}: {len(recording.done)} of {total} poses; run again to continue")
         raise
-    return ""
+    return None
 
 
 def require_simulated(config: Config) -> None:

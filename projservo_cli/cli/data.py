@@ -65,7 +65,9 @@ def _teach(
     from projservo_cli.records import InputError, WorkFailed
     from projservo_cli.settings.sections import JointVector
     from projservo_cli.stages import teach as stage
-    from projservo_cli.stages.record import sharing
+    from projservo_cli.words import line
+    from projservo_cli.words.table import Setup
+    from projservo_cli.words.values import sharing
 
     output = output or Path("start.yaml" if start else "goal.yaml")
     option.require_new(output, force=force)
@@ -82,7 +84,7 @@ def _teach(
     calibrated = option.calibrated_run(run, settings)
     calibration = None if calibrated is None else calibrated.calibration
     asks = not settings.plant.simulated and sys.stdin.isatty()
-    hidden = ""
+    hidden = None
     with writing(output):
         try:
             taught = stage.teach(teach_inputs(settings), frames, put, console.wait if asks else None)
@@ -97,9 +99,10 @@ def _teach(
                 check = stage.checked(plan_inputs(settings), calibration, taught)
         except WorkFailed as error:
             reason = " ".join(str(error).split()).removeprefix("teach: ")
-            value = {"file": output.resolve(), "failed": "teach", "reason": reason}
+            found = [one.plain() for one in error.findings]
+            value = {"file": output.resolve(), "failed": "teach", "reason": reason, "findings": found}
             console.report(value, ["teach: failed; no file was written"])
-            raise WorkFailed(f"teach: {reason}") from error
+            raise WorkFailed(f"teach: {reason}", findings=error.findings) from error
         write_whole(output, _TAUGHT + plain_yaml(taught.as_goal()))
     # Names are relative to the configuration, in the file and with --set.
     is_relative = config is not None and Path(config).resolve().parent == output.resolve().parent
@@ -114,9 +117,9 @@ def _teach(
             f"{sharing(taught.view)} all tags, and teach again with --force"
         )
     if hidden:
-        console.say(hidden)
+        console.say(f"teach: {line(hidden, Setup(view=taught.view))}")
     if check is not None and not check.reached:
-        raise WorkFailed(f"{output}: by the calibration, {check.reason}")
+        raise WorkFailed(f"{output}: by the calibration, {check.reason}", findings=check.findings)
 
 
 def _print_taught(console: Console, path: Path, taught: Any, check: Any, setting: str) -> None:
@@ -133,7 +136,9 @@ def _print_taught(console: Console, path: Path, taught: Any, check: Any, setting
         "moved": taught.moved,
         "objects": {name: int(one.shared) for name, one in taught.objects.items()},
     }
-    value |= dict.fromkeys(("off_px", "far", "reached", "reason")) if check is None else check._asdict()
+    keys = "off_px", "far", "reached", "reason", "findings"
+    value |= dict.fromkeys(keys) if check is None else check._asdict()
+    value["findings"] = None if check is None else [one.plain() for one in check.findings]
     certain = f", to {np.nanmax(taught.sigma):.3g} px" if np.isfinite(taught.sigma).any() else ""
     known, shared = len(taught.marker), taught.shared
     where = {1: "", 2: " in both views,"}.get(len(taught.view), " in two views,")

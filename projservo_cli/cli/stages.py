@@ -1,7 +1,7 @@
 """Commands of the stages and of their chain: dry run, work, summary."""
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,6 +16,7 @@ from projservo_cli.cli.program import FAILED, main
 if TYPE_CHECKING:
     from projservo_cli.chain import Chain
     from projservo_cli.config import Config
+    from projservo_cli.findings import Finding
     from projservo_cli.store.run_file import Run
 
 _NAMING = {"plant": {"plant", "plant.use"}, "law": {"control", "control.laws"}}  # keys of --set
@@ -138,24 +139,25 @@ def _record(stages: Sequence[str], /, console: Console, **options: Any) -> int:
     config = option.configured(options["config"], options)
     path = options["output"] or data_table(config)
     poses, given = _motions(config, options), recording_inputs(config)
-    recording, reason = new_recording(given, path, motions=poses, force=options["force"]), ""
+    recording, why = new_recording(given, path, motions=poses, force=options["force"]), None
     if not (recording.why or config.plant.simulated):
         console.say(f"record: {path} is up to date{_AGAIN}")
     if not options["dry_run"]:
         with writing(path):
             recording = new_recording(given, path, motions=poses, force=options["force"])
-            reason = recording_made(console, config, recording, confirm=options["confirm"])
-    value = _recording_object(recording, reason)
+            why = recording_made(console, config, recording, confirm=options["confirm"])
+    value = _recording_object(recording, *(("", ()) if why is None else (str(why), why.findings)))
     console.report(value, [*words_of("record", value), *([f"table: {path}"] if path.exists() else [])])
-    if reason:
-        click.echo(visible(f"projservo: record: {reason}"), err=True)
-    return FAILED if reason else 0
+    if why:
+        click.echo(visible(f"projservo: record: {why}"), err=True)
+    return FAILED if why else 0
 
 
-def _recording_object(recording: Any, reason: str) -> dict[str, Any]:
+def _recording_object(recording: Any, reason: str, found: "Iterable[Finding]") -> dict[str, Any]:
     """The JSON object of a recording, and why it stopped short where it did."""
     explained: dict[str, Any] = recording.summary
-    return explained | ({"reason": reason, "failed": "record"} if reason else {})
+    why = {"reason": reason, "findings": [one.plain() for one in found], "failed": "record"}
+    return explained | (why if reason else {})
 
 
 def _motions(config: Any, options: Mapping[str, Any]) -> Any:
@@ -517,8 +519,8 @@ def _work(console: Console, chain: "Chain", options: Mapping[str, Any]) -> int:
     values, joints = {}, chain.config.joint_names
     for name in chain.names:
         if name == "record":
-            reason = chain.reason if chain.lacks(name) else ""
-            values[name] = {"run": chain.run.path.resolve()} | _recording_object(chain.recording, reason)
+            why = (chain.reason, chain.evidence) if chain.lacks(name) else ("", ())
+            values[name] = {"run": chain.run.path.resolve()} | _recording_object(chain.recording, *why)
         elif chain.lacks(name):
             why = chain.reason, chain.evidence
             values[name] = failed_object(name, chain.run, why, chain.failed, chain.laws_done)

@@ -1,13 +1,13 @@
 """Settings of a robot: its joints and their limits, and its servos."""
 
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from projservo_cli.calibration.detections import per_rad
-from projservo_cli.records import Calibration, FloatArray, InputError, JointLimits, in_unit
+from projservo_cli.findings import REFUSES, Finding, Subject
+from projservo_cli.records import Calibration, FloatArray, InputError, JointLimits
 from projservo_cli.robots.contract import Bounds
 
 
@@ -31,17 +31,18 @@ class Joints(NamedTuple):
         """An angle as (n,) rad, for prismatic joints the length, m, that makes as much of a difference."""
         return math.radians(degrees) * per_rad(np.array([*self.types]) == "P")
 
-    def limit_passed(self, q: FloatArray) -> str:
-        """Return which of the readings (n,), rad or m, lies beyond its limits, in words; empty for none."""
-        return limit_passed(q, self.limits, self.units)
+    def limit_passed(self, q: FloatArray) -> Finding | None:
+        """Return which of the readings (n,), rad or m, lies beyond its limits; None if none does."""
+        return limit_passed(q, self.limits, self.types)
 
 
-def limit_passed(q: FloatArray, limits: JointLimits, units: Sequence[str]) -> str:
-    """Return which of the readings (n,), rad or m, lies beyond its limits, in its unit; empty for none."""
+def limit_passed(q: FloatArray, limits: JointLimits, types: str) -> Finding | None:
+    """Return which of the readings (n,), rad or m, lies beyond its limits; None if none does."""
     for i in np.flatnonzero((q < limits.lower) | (q > limits.upper)).tolist():
-        at, low, high = (in_unit(values[i], units[i]) for values in (q, limits.lower, limits.upper))
-        return f"joint {i + 1} would be at {at}, beyond its limits {low} to {high}"
-    return ""
+        unit, joint = "m" if types[i] == "P" else "rad", Subject(joints=(i + 1,))
+        ends = (Finding("range", amount=limits.lower[i], limit=limits.upper[i], unit=unit),)
+        return Finding("limit_passed", REFUSES, joint, q[i], unit=unit, others=ends)
+    return None
 
 
 class JointSettings(NamedTuple):

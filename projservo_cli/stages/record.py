@@ -12,9 +12,11 @@ from typing import Any
 
 import numpy as np
 
+from projservo_cli import words
 from projservo_cli.calibration.detections import per_rad
 from projservo_cli.detection import DICTIONARY, MIN_CELL, cells_of
 from projservo_cli.files import write_whole
+from projservo_cli.findings import NOTE, REFUSES, Finding, Subject
 from projservo_cli.hardware.checks_at_rest import MIN_SHARED
 from projservo_cli.records import (
     CORNERS,
@@ -26,8 +28,6 @@ from projservo_cli.records import (
     IntArray,
     JointList,
     Observation,
-    WorkFailed,
-    in_unit,
 )
 from projservo_cli.report.live_page import annotated, recording_page
 from projservo_cli.robots.contract import PluginRobot, Reading, at_rest_after
@@ -41,6 +41,7 @@ from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.external_robot import path_to, plugin_robot, simulated_robot
 from projservo_cli.stages.stage_inputs import OwnRobot, RecordingInputs, Trials
 from projservo_cli.store.observation_tables import identity_in, read_table, recording_of, write_table
+from projservo_cli.words.table import Setup
 
 _SAVE_EVERY = 1.0  # s; maximum loss by an interruption without warning
 _SLACK = 1e-3  # rad or m; how far beyond its sag a reading may be from where the pose was to be
@@ -82,17 +83,20 @@ class _Recording:
         return sum(int(np.isnan(reading.s[..., 0]).sum()) for reading in self.done.values())
 
     def note(self, units: Sequence[str] = ()) -> str:
-        """Return how many markers each view saw at the last pose, and the joint farthest off its target.
+        """Return the words on the last pose, and the joint that was farthest off its target; empty for none.
 
         units : of the joints; empty for rad.
         """
         if not self.done:
             return ""
-        last = self.done[max(self.done)]
-        seen = "|".join(map(str, np.isfinite(last.s[..., 0]).sum(axis=1).tolist()))
+        seen = np.isfinite(self.done[max(self.done)].s[..., 0]).sum(axis=1).tolist()
         off = np.array([np.abs(one.q - self.targets[pose]) for pose, one in self.done.items()]).max(axis=0)
         i = int(off.argmax())
-        return f"markers {seen}, joint {i + 1} {in_unit(off[i], units[i] if units else 'rad', 2)} off"
+        counts = tuple(Finding("seen", amount=count) for count in seen)
+        unit = "m" if units and units[i] == "m" else "rad"
+        return words.line(
+            Finding("farthest_off", NOTE, Subject(joints=(i + 1,)), off[i], unit=unit, others=counts)
+        )
 
     @property
     def spread_px(self) -> float | None:
@@ -162,8 +166,8 @@ def trial_motions(trials: Trials) -> FloatArray:
             q[i] += offset
             if wrong := joints.limit_passed(q):
                 raise InputError(
-                    f"calibration: in a trial {wrong}: choose another calibration.reference or a smaller "
-                    "amplitude"
+                    f"calibration: in a trial {words.sentence(wrong)}: choose another "
+                    "calibration.reference or a smaller amplitude"
                 )
             rows.append(q)
     rng = generator(motions.seed, TRIAL_POSES)
@@ -233,7 +237,7 @@ def new_recording(
     if motions is not None:
         for pose, q in zip(motions.pose, motions.q, strict=True):
             if wrong := joints.limit_passed(q):
-                raise InputError(f"motions: pose {pose}: {wrong}: choose another")
+                raise InputError(f"motions: pose {pose}: {words.sentence(wrong)}: choose another")
         targets = np.vstack([targets, motions.q])
     numbers = np.array(inputs.numbers, dtype=np.int64)
     recording = _Recording(path or Path(), key, targets, numbers, mount=inputs.mount)
@@ -411,21 +415,11 @@ def shared_markers(s: FloatArray) -> BoolArray:
     return seen
 
 
-def all_of(views: Sequence[str]) -> str:
-    """Name all cameras in a message."""
-    return {1: f"the {views[0]} camera", 2: "both cameras"}.get(len(views), "the cameras")
-
-
-def sharing(views: Sequence[str]) -> str:
-    """Begin a message on what two cameras see together, or one by itself."""
-    return {1: f"the {views[0]} camera sees", 2: "both cameras see"}.get(len(views), "two cameras see")
-
-
 @dataclass(frozen=True, eq=False)
 class _Sight:
     """Checks that a recording suffices for a calibration, before the first motion and after each joint.
 
-    Messages name the place, the number and the limit: a recording of nothing takes as long as any other.
+    A recording of nothing takes as long as any other.
     """
 
     inputs: RecordingInputs
@@ -434,9 +428,9 @@ class _Sight:
     def before(self, robot: PluginRobot, reading: Reading) -> None:
         """Refuse to move if the first readings, for a while, show too few markers."""
         period, waited = robot.bounds.period, 0.0
-        while wrong := self._wrong(reading.s[None], "where the robot stands"):
+        while wrong := self._wrong(reading.s[None], Subject()):
             if waited >= self.inputs.trials.settle_s:  # a camera may need some time for its first image
-                raise WorkFailed(f"record: {wrong}; nothing was moved")
+                raise words.failed([wrong], self.setup, "record: ", "; nothing was moved")
             time.sleep(period)
             waited, reading = waited + period, robot.read()
 
@@ -452,12 +446,20 @@ class _Sight:
         ):
             return
         s = np.array([self.recording.done[k].s for k in group])
-        if wrong := self._wrong(s, f"in the {len(s)} poses of joint {i}") or self._faceless():
-            remedy = "choose another calibration.reference or a smaller calibration.amplitude_deg"
-            raise WorkFailed(f"record: {wrong}, or {remedy}; then start again with --force (force=True)")
+        if wrong := self._wrong(s, Subject(joints=(i,), poses=tuple(group))) or self._faceless():
+            end = (
+                ", or choose another calibration.reference or a smaller calibration.amplitude_deg; then "
+                "start again with --force (force=True)"
+            )
+            raise words.failed([wrong], self.setup, "record: ", end)
 
-    def _faceless(self) -> str:
-        """Tell which marker of the face no pose shows to two cameras so far; empty where there is none.
+    @property
+    def setup(self) -> Setup:
+        """The cameras."""
+        return Setup(self.recording.mount, self.recording.view, self.recording.targets.shape[1])
+
+    def _faceless(self) -> Finding | None:
+        """Tell which marker of the face no pose shows to two cameras so far; None where there is none.
 
         One camera shows it by itself.
         """
@@ -465,46 +467,31 @@ class _Sight:
         shared = np.any([shared_markers(one.s) for one in done.values()], axis=0)
         lost = [k for k in self.recording.marker[~shared].tolist() if k in face]
         if not lost:
-            return ""
-        return (
-            f"{sharing(self.recording.view)} marker {lost[0]} of the face, markers.face {[*face]}, at "
-            f"none of {len(done)} poses: turn the face towards them"
-        )
+            return None
+        return Finding("faceless", REFUSES, Subject(markers=tuple(lost)), len(done), unit="1")
 
-    def _wrong(self, s: FloatArray, where: str) -> str:
-        """Tell why looks (k, V, m, 2) are of no use; empty where they are."""
+    def _wrong(self, s: FloatArray, where: Subject) -> Finding | None:
+        """Tell why looks (k, V, m, 2) are of no use; None where they are."""
         seen, given, views = np.isfinite(s[..., 0]), self.inputs.dictionary, self.recording.view
         blind, total = ~seen.any(axis=(0, 2)), seen.shape[2]
         if blind.all():
-            of = f", which is {given} here" if given else ""
-            return (
-                f"{'neither' if len(views) == 2 else 'no'} camera sees one of the {total} markers {where}: "
-                f"look whether they stand before {all_of(views)}, at light and focus, and whether the "
-                f"dictionary of the tags is right{of}"
-            )
+            return Finding("no_markers", REFUSES, replace(where, name=given or ""), 0, limit=total, unit="1")
         cells = cells_of(given or DICTIONARY)
         for view, side in zip(views, self._widths(s), strict=True):
             if side < MIN_CELL * cells:
-                return (
-                    f"tags are {side:.3g} px wide in the {view} image {where}, {side / cells:.2g} px a cell "
-                    f"({MIN_CELL:g} at least): take larger tags, nearer cameras, or more pixels"
+                width, subject = (Finding("width", amount=side, unit="px"),), replace(where, views=(view,))
+                return Finding(
+                    "narrow_tags", REFUSES, subject, side / cells, limit=MIN_CELL, unit="px", others=width
                 )
         if blind.any():
-            most = int(seen.sum(axis=(0, 2)).argmax())
-            count = int(seen.sum(axis=2).max())
-            return (
-                f"the {views[int(blind.argmax())]} camera sees none of the {total} markers {where}, the "
-                f"{views[most]} one {count}: turn it towards them, and look at its light and focus"
-            )
+            most, count = int(seen.sum(axis=(0, 2)).argmax()), int(seen.sum(axis=2).max())
+            subject = replace(where, views=(views[int(blind.argmax())], views[most]))
+            return Finding("unseeing_camera", REFUSES, subject, count, limit=total, unit="1")
         often = -(-len(s) // 2)
         shared = int((shared_markers(s).sum(axis=0) >= often).sum())
-        if shared < MIN_SHARED:
-            half = "" if len(s) == 1 else ", half of them or more"
-            return (
-                f"{sharing(views)} only {shared} of the {total} markers {where}{half} ({MIN_SHARED} at "
-                f"least): turn the tool towards {all_of(views)}, and remove what occludes it"
-            )
-        return ""
+        least = (Finding("share", amount=MIN_SHARED, unit="1"),)
+        few = Finding("few_shared", REFUSES, where, shared, limit=total, unit="1", others=least)
+        return few if shared < MIN_SHARED else None
 
     def _widths(self, s: FloatArray) -> list[float]:
         """Widest side of a tag in each view, px; infinite where markers are not known to be tags.

@@ -57,6 +57,7 @@ from projservo_cli.task.body import NO_BODY, Body, make_body
 from projservo_cli.task.incidences import Flat, Incidence
 from projservo_cli.task.stand_off import StandOff, displacement_back
 from projservo_cli.task.target import TaskImages, is_stereo
+from projservo_cli.words import sentence
 
 _GUESSED = 1e-3  # weight of a marker in a fit that is predicted from others
 
@@ -414,9 +415,7 @@ def scenario_of(inputs: PlanInputs, calibration: Calibration | None = None) -> S
         )
     if truth is not None:
         at = None if inputs.q_current is None else tuple(inputs.q_current.tolist())
-        exact, ends, q_goal = _simulated_ends(
-            task, joints.types, joints.units, truth, pins, inputs.center, current=at
-        )
+        exact, ends, q_goal = _simulated_ends(task, joints.types, truth, pins, inputs.center, current=at)
     else:
         assert calibration is not None
         exact, ends, q_goal = _predicted_ends(inputs, task, calibration, joints, (*face, *pins))
@@ -588,7 +587,6 @@ def observed_numbers(inputs: PlanInputs, calibration: Calibration) -> tuple[int,
 def _simulated_ends(
     task: TaskSettings,
     types: str,
-    units: tuple[str, ...],
     truth: Truth,
     pins: tuple[int, ...],
     center: int,
@@ -604,8 +602,8 @@ def _simulated_ends(
 
     def images(q: FloatArray, key: str) -> FloatArray:
         """Both apart, so that the face has the same bits with any pins."""
-        if wrong := limit_passed(q, robot.limits, units):
-            raise WorkFailed(f"{key}: {wrong}: choose others or wider limits")
+        if wrong := limit_passed(q, robot.limits, types):
+            raise WorkFailed(f"{key}: {sentence(wrong)}: choose others or wider limits")
         return np.concatenate([truth.images(q, truth.M_face), truth.images(q, M_pins)], axis=1)
 
     def turn(q: FloatArray) -> FloatArray:
@@ -684,7 +682,7 @@ def _predicted_ends(
 
     def images(q: FloatArray, key: str) -> FloatArray:
         if wrong := joints.limit_passed(q):
-            raise InputError(f"{key}: {wrong}: choose another")
+            raise InputError(f"{key}: {sentence(wrong)}: choose another")
         s = predict(calibration, q[None])[0][:, columns]
         if np.isnan(s[:, :m]).any(axis=(1, 2)).sum() > len(s) - least:
             raise WorkFailed(f"{key}: by the calibration, the face is not in front of the cameras there")

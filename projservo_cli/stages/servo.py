@@ -62,7 +62,6 @@ from projservo_cli.simulation.faults import obstruction_of
 from projservo_cli.simulation.workspace import Truth
 from projservo_cli.stages import external_robot
 from projservo_cli.stages.motions import PathReplanner, search_of, why_closed
-from projservo_cli.stages.record import all_of
 from projservo_cli.stages.scenario import RunScenario, run_scenario
 from projservo_cli.stages.stage_inputs import ServoInputs
 from projservo_cli.task.body import SETTLED, fit_body, make_body
@@ -79,6 +78,7 @@ from projservo_cli.task.target import TaskImages, followed
 from projservo_cli.words import line, lines, order_advice, text
 from projservo_cli.words.runs import VERDICTS, arrived
 from projservo_cli.words.table import Setup
+from projservo_cli.words.values import all_of
 
 _RETREAT = 10  # periods by which an arm goes back where the object of its goal moves
 _NOT_DRIVEN: Any = None  # in place of what a run leaves

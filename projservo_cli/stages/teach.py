@@ -8,8 +8,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from projservo_cli import words
 from projservo_cli.calibration.prediction import predict
 from projservo_cli.display import require_radians
+from projservo_cli.findings import LIMITS, REFUSES, Finding, Subject
 from projservo_cli.hardware.checks_at_rest import MIN_SHARED
 from projservo_cli.records import Calibration, FloatArray, InputError, IntArray, WorkFailed
 from projservo_cli.robots.contract import Bounds, PluginRobot, Reading, at_rest_after
@@ -21,9 +23,10 @@ from projservo_cli.simulation.faults import FaultyRobot, SimulatedRobot, robot_b
 from projservo_cli.simulation.streams import TAUGHT_NOISE, generator
 from projservo_cli.stages import plan as planning
 from projservo_cli.stages.external_robot import plugin_robot, simulated_robot, takes_limits
-from projservo_cli.stages.record import all_of, shared_markers, sharing
+from projservo_cli.stages.record import shared_markers
 from projservo_cli.stages.stage_inputs import OwnRobot, PlanInputs, TeachInputs
 from projservo_cli.task.displaced_object import RIGID
+from projservo_cli.words.table import Setup
 
 _FAR = 4.0  # standard deviations that a marker may be off
 _DIGITS = 4  # of pixels that are written
@@ -94,6 +97,7 @@ class _Checked(NamedTuple):
     far: list[tuple[int, str, float]]  # markers beyond what noise explains, which view, how far, px
     reached: bool
     reason: str  # whether joints reach it, in words
+    findings: tuple[Finding, ...]  # likewise
 
 
 def teach(
@@ -132,8 +136,8 @@ def teach(
             wait("take your hands away")
         rest, mean, sigma, count = seen_at_rest(robot, observe, frames, inputs.settle_s, "teach")
         stood = rest.q if moved is None else moved
-        since = "while images were taken" if moved is None else "since the arm was held again"
-        _require_still(robot.bounds, stood, robot.read().q, since)
+        code = "moved_in_images" if moved is None else "moved_since_held"
+        _require_still(robot.bounds, stood, robot.read().q, code)
     tool = _Taught(
         marker=np.array(inputs.numbers, dtype=np.int64),
         q=mean.q,
@@ -193,20 +197,18 @@ def _within_limits(at: JointVector, joints: Joints) -> FloatArray:
     if wrong := joints.limit_passed(q):
         if at.unit == "rad":
             require_radians("--at", q, joints.types, "set --at-unit deg")
-        raise InputError(f"--at: {wrong}: choose others")
+        raise InputError(f"--at: {words.sentence(wrong)}: choose others")
     return q
 
 
-def _require_still(bounds: Bounds, before: FloatArray, after: FloatArray, since: str) -> None:
-    """Raise WorkFailed if a joint has moved by more than it may sag."""
+def _require_still(bounds: Bounds, before: FloatArray, after: FloatArray, code: str) -> None:
+    """Raise WorkFailed, a finding of a code, if a joint has moved by more than it may sag."""
     off, most = np.abs(after - before), bounds.sag + _SLACK
     i = int(np.argmax(off / most))
     if off[i] > most[i]:
-        raise WorkFailed(
-            f"teach: joint {i + 1} moved by {bounds.text(i, off[i], 3)} {since} "
-            f"({bounds.text(i, most[i], 3)} at most): take the hands away when asked to, and check "
-            "whether the arm holds its load; nothing was written"
-        )
+        unit, joint = "m" if [*bounds.units][i : i + 1] == ["m"] else "rad", Subject(joints=(i + 1,))
+        found = Finding(code, REFUSES, joint, off[i], limit=most[i], unit=unit)
+        raise words.failed([found], begin="teach: ", end="; nothing was written")
 
 
 def _put_to(inputs: TeachInputs, simulated: SimulatedRobot, q: FloatArray) -> FaultyRobot:
@@ -250,10 +252,10 @@ def checked(inputs: PlanInputs, calibration: Calibration, taught: _Taught) -> _C
     )
     try:
         plan = planning.run(asked, calibration)
-        reached, reason = plan.feasible, plan.reason
+        reached, reason, found = plan.feasible, plan.reason, plan.findings
         q = plan.q[-1] if reached else taught.q
     except WorkFailed as error:
-        reached, reason, q = False, str(error), taught.q
+        reached, reason, found, q = False, str(error), error.findings, taught.q
     numbers = taught.marker.tolist()
     known_to_both = np.flatnonzero(np.isin(numbers, calibration.marker))
     off = np.full(sigma.shape, np.nan)
@@ -264,36 +266,35 @@ def checked(inputs: PlanInputs, calibration: Calibration, taught: _Taught) -> _C
         (numbers[k], calibration.view[view], float(off[view, k]))
         for view, k in np.argwhere(off > _FAR * math.sqrt(2.0) * noise).tolist()
     ]
-    return _Checked(off, far, reached, reason)
+    return _Checked(off, far, reached, reason, found)
 
 
 def require_start(taught: _Taught) -> None:
     """Refuse a start from which nothing can be recorded, since cameras see too little; a WorkFailed."""
     if taught.shared < MIN_SHARED:
         counts = zip(taught.view, np.isfinite(taught.s[..., 0]).sum(axis=1), strict=True)
-        seen = "" if len(taught.view) == 1 else "; " + ", ".join(f"{name} {count}" for name, count in counts)
-        raise WorkFailed(
-            f"teach: {sharing(taught.view)} {taught.shared} of {len(taught.marker)} markers ({MIN_SHARED} at "
-            f"least{seen}): turn the tool towards {all_of(taught.view)}, and look at light and focus"
+        seen = [Finding("seen", subject=Subject(views=(name,)), amount=count) for name, count in counts]
+        parts = Finding("share", amount=MIN_SHARED, unit="1"), *(seen if len(seen) > 1 else ())
+        few = Finding(
+            "few_shared", REFUSES, amount=taught.shared, limit=len(taught.marker), unit="1", others=parts
         )
+        raise words.failed([few], Setup(view=taught.view), "teach: ")
 
 
-def require_objects(taught: _Taught, *, one_goal: bool) -> str:
-    """Return which objects show too little to carry a goal along, or that all are out of sight; else "".
+def require_objects(taught: _Taught, *, one_goal: bool) -> Finding | None:
+    """Return which object shows too little to carry a goal along, or that all are out of sight; else None.
 
     one_goal : whether there is no other goal, so that this one is on an object; a WorkFailed says it then.
     """
     seen = {name: _seen_of(one) for name, one in taught.objects.items()}
     for name, numbers in seen.items():
         if 0 < len(numbers) < RIGID or not any(seen.values()):
-            told = (
-                f"teach: of the object {name}, {all_of(taught.view)} see marker "
-                f"{', '.join(map(str, numbers)) or 'none'} ({RIGID} at least)"
-            )
+            subject = Subject(markers=tuple(numbers), name=name)
+            hidden = Finding("hidden_object", LIMITS, subject, len(numbers), limit=RIGID, unit="1")
             if one_goal:
-                raise WorkFailed(f"{told}: turn it towards {all_of(taught.view)}, or leave it out of objects")
-            return f"{told}: for a goal on it, turn it towards {all_of(taught.view)} and teach with --force"
-    return ""
+                raise words.failed([replace(hidden, severity=REFUSES)], Setup(view=taught.view), "teach: ")
+            return hidden
+    return None
 
 
 def _seen_of(one: _Taught) -> list[int]:
@@ -311,7 +312,5 @@ def require_face(face: Sequence[int], taught: _Taught, least: int | None = None)
     shared = {*taught.marker[enough].tolist()}
     if unseen := [(number, side) for number, side in taught.unseen if number in {*face} - shared]:
         number, side = unseen[0]
-        raise WorkFailed(
-            f"teach: the {side} camera does not see marker {number} of the face, markers.face {[*face]}: "
-            f"turn the face towards {all_of(taught.view)}"
-        )
+        hidden = Finding("hidden_face", REFUSES, Subject(views=(side,), markers=(number,)))
+        raise words.failed([hidden], Setup(view=taught.view), "teach: ")

@@ -30,7 +30,7 @@ def limit(one: Finding, setup: Setup) -> str:
     return Told([one], setup).text("limit")
 
 
-def sentence(one: Finding, setup: Setup) -> str:
+def sentence(one: Finding, setup: Setup = _SETUP) -> str:
     """Return the sentence on a finding, without its remedy."""
     return _sentence([one], setup)
 
@@ -53,10 +53,10 @@ def row(one: Finding, setup: Setup) -> dict[str, str]:
     return {"level": _LEVELS[one.severity], "where": where, "text": sentence(one, setup), "remedy": remedy}
 
 
-def failed(findings: Iterable[Finding], setup: Setup = _SETUP, begin: str = "") -> WorkFailed:
-    """Return the error that findings are, told after a beginning such as ``teach: ``."""
+def failed(findings: Iterable[Finding], setup: Setup = _SETUP, begin: str = "", end: str = "") -> WorkFailed:
+    """Return the error that findings are, told between a beginning such as ``teach: `` and an end."""
     found = tuple(findings)
-    return WorkFailed(begin + text(found, setup), findings=found)
+    return WorkFailed(f"{begin}{text(found, setup)}{end}", findings=found)
 
 
 def text(findings: Iterable[Finding], setup: Setup) -> str:

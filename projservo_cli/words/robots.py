@@ -4,6 +4,7 @@ from projservo_cli.words.rows import Row
 
 # A number of a tag or a marker that occurs twice in an image, and servos that are left alone.
 _UNIQUE = "a number must be unique: print another one, or cover the tag that is not on the tool"
+_HANDS = "take the hands away when asked to, and check whether the arm holds its load"
 _SINKS = "; it is sent nothing more, and may sink"
 
 
@@ -208,8 +209,8 @@ ROBOTS: dict[str, Row] = (
     | _about(
         "{images}",
         few_shared=(
-            "{share} {count} of {total} markers ({rest} at least)",
-            "turn the tool towards {towards}, or move {it_or_them}",
+            "{sharing} only {count} of {total} markers{looked}{half} ({rest} at least{seen})",
+            "turn the tool towards {towards}, and look at light, focus and what occludes it",
         ),
         shared_markers=("{share} {count} of {total} markers",),
         unshared_face=(
@@ -289,5 +290,34 @@ ROBOTS: dict[str, Row] = (
             "put the {view} camera back, or fit it again from {of_poses} poses, after which it errs by "
             "{amount} ({limit} before it moved)",
         ),
+        farthest_off=("markers {counts}, {joints} {size} off",),
+        no_markers=(
+            "{no} camera sees one of the {total} markers{looked}",
+            "look whether they stand before {towards}, at light and focus, and whether the dictionary of "
+            "the tags is right{here}",
+        ),
+        narrow_tags=(
+            "tags are {part} wide in the {view} image{looked}, {amount} a cell ({limit} at least)",
+            "take larger tags, nearer cameras, or more pixels",
+        ),
+        unseeing_camera=(
+            "the {view} camera sees none of the {total} markers{looked}, the {other_view} one {count}",
+            "turn it towards them, and look at its light and focus",
+        ),
+        faceless=("{sharing} marker {numbers} of the face at none of {count} poses", "turn it to them"),
+        hidden_face=(
+            "the {view} camera does not see marker {numbers} of the face",
+            "turn the face towards {towards}",
+        ),
+        hidden_object=(
+            "of the object {name}, {sharing} marker {some} ({total} at least)",
+            "turn it towards {towards}, or leave it out of objects; --force teaches again",
+        ),
+        moved_in_images=("{joints} moved by {amount} while images were taken ({limit} at most)", _HANDS),
+        moved_since_held=(
+            "{joints} moved by {amount} since the arm was held again ({limit} at most)",
+            _HANDS,
+        ),
+        limit_passed=("{joints} would be at {amount}, beyond its limits {part} to {of_part}",),
     )
 )

@@ -227,6 +227,24 @@ def servo_name(subject: Subject) -> str:
     return f"{numbered('joint', subject.joints)} ({subject.name})" if subject.joints else subject.name
 
 
+def all_of(views: Sequence[str]) -> str:
+    """Name all cameras in a message."""
+    return {1: f"the {views[0]} camera", 2: "both cameras"}.get(len(views), "the cameras")
+
+
+def sharing(views: Sequence[str]) -> str:
+    """Begin a message on what two cameras see together, or one by itself."""
+    return {1: f"the {views[0]} camera sees", 2: "both cameras see"}.get(len(views), "two cameras see")
+
+
+def _looked(told: Told) -> str:
+    """Say where a recording looked: in the poses of a joint, or where the robot stands."""
+    poses = len(told.subject.poses)
+    return (
+        f" in the {poses} poses of {numbered('joint', told.joints)}" if poses else " where the robot stands"
+    )
+
+
 def _by_views(told: Told, one: str, two: str, more: str) -> str:
     """Choose words by the number of the cameras."""
     return {1: one, 2: two}.get(len(told.setup.view), more)
@@ -370,8 +388,15 @@ VALUES: dict[str, Callable[[Told], object]] = {
     "share": lambda told: _by_views(told, "shows", "share", "two or more show"),
     "lack": lambda told: _by_views(told, "does not show", "do not both show", "fewer than two show"),
     "images": lambda told: _by_views(told, "image", "both images", "images"),
-    "towards": lambda told: _by_views(told, "the camera", "both cameras", "the cameras"),
-    "it_or_them": lambda told: _by_views(told, "it", "them", "them"),
+    "towards": lambda told: all_of(told.setup.view),
+    "sharing": lambda told: sharing(told.setup.view),
+    "looked": _looked,
+    "half": lambda told: ", half of them or more" if told.subject.poses else "",
+    "seen": lambda told: "".join(f"; {one.subject.views[0]} {one.amount:.0f}" for one in told.one.others[1:]),
+    "counts": lambda told: "|".join(f"{one.amount:.0f}" for one in told.one.others),
+    "no": lambda told: "neither" if len(told.setup.view) == 2 else "no",
+    "here": lambda told: f", which is {told.subject.name} here" if told.subject.name else "",
+    "some": lambda told: examples(told.subject.markers) or "none",
     "readings": lambda told: ", ".join(quantity(one.amount, one.unit, 4) for one in told.one.others),
     "amounts": lambda told: ", ".join(map(_play, told.one.others)),
     "servo": lambda told: servo_name(told.subject),

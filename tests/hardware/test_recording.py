@@ -64,10 +64,10 @@ def test_a_recording_notes_its_worst_joint_and_shows_the_last_images(projservo, 
     answer = projservo("record", "-c", "arm.yaml", "-o", "arm.csv", "--json")
     assert answer.code == 0, answer.err
     assert [note[:3] for note in notes] == [("record", k, 6) for k in range(1, 7)]
-    assert notes[-1][3] == f"markers {seen}, joint 2 0.1 deg off"
+    assert notes[-1][3] == f"markers {seen}, joint 2 0.1° off"
     assert read_table("arm.csv").view == view
     page = (recording / "arm.html").read_text(encoding="utf-8")
-    assert f"6 of 6 poses; markers {seen}, joint 2 0.1 deg off" in page
+    assert f"6 of 6 poses; markers {seen}, joint 2 0.1° off" in page
     assert page.count("data:image/jpeg;base64,") == len(view)
     assert 'http-equiv="refresh"' not in page
 

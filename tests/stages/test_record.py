@@ -112,7 +112,7 @@ def test_further_motions_follow_the_trials_and_continue_their_table(projservo):
     Path("far.csv").write_text("pose,q1,q2,q3,q4,q5,q6\n8,0,0,0,0,0,7\n")
     refused = projservo("record", "-c", UR5, *FEW, "--motions", "far.csv", "-o", "u.csv")
     assert refused.code == 2
-    assert "pose 8: joint 6 would be at 7 rad, beyond its limits" in refused.err
+    assert "pose 8: joint 6 would be at 401°, beyond its limits" in refused.err
     assert not Path("u.csv").exists()
 
 
@@ -323,9 +323,9 @@ def shrunk(q, s):
         ),
         (
             without(0, *range(2, 20)),
-            r"both cameras see only 2 of the 20 markers where the robot stands \(3 at",
+            r"both cameras see only 2 of 20 markers where the robot stands \(3 at",
         ),
-        (shrunk, r"tags are 10\.\d px wide in the left image .*, 1\.\d+ px a cell \(1\.8 at least\)"),
+        (shrunk, r"tags are 10\.\d px wide in the left image .*, 1\.\d+ px a cell \(1\.8 px at least\)"),
     ],
 )
 def test_what_cannot_be_used_is_named_before_anything_moves(seen, message):
@@ -350,7 +350,7 @@ def test_after_each_joint_what_it_showed_must_be_of_use_and_is_kept():
             s[0, 2:] = np.nan
         return s
 
-    few = r"only 2 of the 20 markers in the 3 poses of joint 2, half of them or more \(3 at least\)"
+    few = r"only 2 of 20 markers in the 3 poses of joint 2, half of them or more \(3 at least\)"
     with pytest.raises(WorkFailed, match=f"{few}.*calibration.amplitude_deg; then start again with --force"):
         stage.record(config, recording, driven(config, Masked(config, seen)))
     assert read_table("t.csv").at_rest.pose.tolist() == [0, 1, 2, 3, 4]

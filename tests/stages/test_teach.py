@@ -122,5 +122,5 @@ def test_a_robot_that_can_let_go_is_held_again_before_it_is_looked_at(tmp_path, 
         (None, 200, "while images were taken"),
     ):
         plant = f"plant={{use: 'by_hand:Arm', settle_s: 0.02, options: {{falls_at: {look}}}}}"
-        with pytest.raises(WorkFailed, match=rf"joint 3 moved by 49 deg {since} \(1\.06 deg at most\)"):
+        with pytest.raises(WorkFailed, match=rf"joint 3 moved by 49° {since} \(1\.06° at most\)"):
             teach(config(plant, "control.period_s=0.001", "control.gain=1"), 100, None, words)
