@@ -593,7 +593,7 @@ class Calibration(StatedErrors, Rejections, FitQuality, ProjectiveKinematics):
         )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class CrossValidation:
     """Repeatability of a calibration: images at poses that the fit which predicts them has not seen.
 
@@ -606,6 +606,9 @@ class CrossValidation:
     unit: str = _scalar(about="poses, or configurations: poses that differ in one joint stay together")
     failed: tuple[str, ...] = _scalar(about="folds without a prediction, each with the reason")
     reason: str = _scalar(about="comparison of the held-out error with the predicted one")
+    findings: tuple[Finding, ...] = _scalar(
+        about="the same: code, severity, subject, amount, deviation, limit, unit, effect", default=()
+    )
     count: int = _scalar(about="number of predicted marker-view pairs")
     rms_px: float | None = _scalar("px", "held-out residual, root mean square")
     median_px: float | None = _scalar("px", "held-out residual, median")

@@ -57,7 +57,6 @@ from projservo_cli.records import (
     apart,
 )
 from projservo_cli.words import failed, with_findings
-from projservo_cli.words.values import quantity
 
 # Minimum number of detections: a camera has 11 numbers, and as many are left to judge them.
 _LEAST = 12
@@ -313,9 +312,11 @@ def _fitted(images: _Images, v: int) -> _Camera:
             used = seen & (distance <= OUTLIER * max(middle, 1.0))
             weight = used.astype(np.float64)
             if used.sum() < max(_LEAST, (1.0 - _MAX_OUTLIERS) * seen.sum()):
-                raise WorkFailed(
-                    f"{(seen & ~used).sum()} of {seen.sum()} detections of the {found.view[v]} camera do not "
-                    f"fit ({100.0 * _MAX_OUTLIERS:g} % allowed): check the joint readings and marker numbers"
+                count, total = float((seen & ~used).sum()), float(seen.sum())
+                allowed = (Finding("outliers", amount=_MAX_OUTLIERS * total, unit="1"),)
+                of = Subject(views=(found.view[v],))
+                raise failed(
+                    [Finding("refit_outliers", REFUSES, of, count, limit=total, unit="1", others=allowed)]
                 )
         J = (images.by_camera(params, v) * weight[..., None, None]).reshape(rows)
         change = (residual * weight[..., None]).reshape(rows)
@@ -398,34 +399,26 @@ def _require_confirmed(camera: _Camera) -> float:
     offset, gain = -left[:n, n] / square, left[:n, n] ** 2 / square
     effect = np.abs(offset) * np.sqrt(np.diagonal(Y.T @ Y)[k : k + n] / count)
 
-    def motions(i: int, *amounts: float) -> list[str]:
-        return [quantity(per[i] * amount, "m" if params.prismatic[i] else "rad") for amount in amounts]
+    def of_joint(code: str, i: int, amount: float, **more: Any) -> WorkFailed:
+        subject = Subject(joints=(found.numbers[i],), views=(name,))
+        unit = "m" if params.prismatic[i] else "rad"
+        return failed([Finding(code, REFUSES, subject, float(per[i] * amount), unit=unit, **more)])
 
     i = int(np.argmax(gain))
     std = float(np.sqrt(max((left[n, n] - gain[i]) / (count - k - 1), 1.0) / square[i]))
     if abs(offset[i]) > _SURE * std and effect[i] > _MATTERS:
-        off, uncertain = motions(i, offset[i], std)
-        raise WorkFailed(
-            f"by the images, joint {found.numbers[i]} is {off} (± {uncertain}) off its readings, which moves "
-            f"images by {effect[i]:.3g} times their noise ({_MATTERS:g} allowed): home it, or calibrate again"
-        )
+        times = (Finding("effect", amount=float(effect[i]), limit=_MATTERS, unit="1"),)
+        raise of_joint("refit_slip", i, offset[i], deviation=float(per[i] * std), others=times)
     ratio = float(np.sqrt(left[n, n] / (count - k)))
     if ratio > REFUSE_RATIO:
-        raise WorkFailed(
-            f"the images are {ratio:.3g} times as far off as noise and covariance explain ({REFUSE_RATIO:g} "
-            "allowed): check the joint readings and the marker numbers"
-        )
+        raise failed([Finding("refit_misfit", REFUSES, amount=ratio, limit=REFUSE_RATIO, unit="1")])
     unnoticed, limit = (
         _SURE * max(ratio, 1.0) / np.sqrt(square),
         max(_UNNOTICED_RAD, 2.0 * (c.sigma_q or 0.0)),
     )
     i = int(np.argmax(unnoticed))
     if unnoticed[i] > limit:
-        far, least = motions(i, unnoticed[i], limit)
-        raise WorkFailed(
-            f"an error of joint {found.numbers[i]} by {far} could pass into the {name} camera unnoticed "
-            f"({least} allowed): add poses that spread farther, or images of a camera that did not move"
-        )
+        raise of_joint("refit_unnoticed", i, unnoticed[i], limit=float(per[i] * limit))
     significant = ratio**2 > chdtri(count - k, _CHANCE) / (count - k)
     return ratio if significant else 1.0
 

@@ -22,6 +22,7 @@ import numpy as np
 from projservo_cli import words
 from projservo_cli.detection import opencv, unfit
 from projservo_cli.findings import LIMITS, REFUSES, Finding, Subject
+from projservo_cli.passwords import masked
 from projservo_cli.records import ByteArray, InputError, WorkFailed
 from projservo_cli.settings.cameras import Source, device_of
 
@@ -233,7 +234,8 @@ class VideoCamera:
             capture = cv.VideoCapture(source)
         if not capture.isOpened():
             holder = None if device is None else _holder(device, self._where)
-            raise self._failed(holder or Finding("unopened", REFUSES, self._where))
+            of = replace(self._where, name=masked(str(source)))
+            raise self._failed(holder or Finding("unopened", REFUSES, of))
         if isinstance(source, int) or device is not None:
             self.remarks = list(_set_up(capture, self.settings, self._where))
         return capture

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from projservo_cli.findings import REFUSES, Finding, Subject
 from projservo_cli.geometry.displacements import (
     carried_screws,
     homogeneous,
@@ -21,15 +22,14 @@ from projservo_cli.geometry.displacements import (
 )
 from projservo_cli.metric.frame import Metric, MetricParameters, base_frame, base_joints, directions, in_frame
 from projservo_cli.records import (
-    MM,
     TOOL,
     BoolArray,
     FloatArray,
     InputError,
     IntArray,
-    WorkFailed,
     letters_of,
 )
+from projservo_cli.words import failed, lines
 
 # Errors of axes that any model has, of machining and assembly, rad and m.
 _LINK_STD = np.repeat([5e-4, 5e-4], 3)
@@ -157,29 +157,30 @@ class _ModelFit:
         size[:, 0] = 2.0 * np.arctan2(chord, np.sqrt(1.0 - chord**2))
         return size, std
 
-    def differences(self) -> list[str]:
-        """Describe the discrete differences between the model and the arm: order, senses, far zeros."""
-        words = []
+    def differences(self) -> list[Finding]:
+        """Return the discrete differences between the model and the arm: order, senses, far zeros."""
+        found = []
         if self.order is not None:
-            i, j = np.flatnonzero(self.order != np.arange(len(self.order)))
-            words.append(f"joints {i + 1} and {j + 1} have each other's place in the model")
-        for i in np.flatnonzero(self.senses < 0):
-            verb = "slides" if self.prismatic[i] else "turns"
-            words.append(f"joint {i + 1} {verb} the other way in the model")
+            i, j = np.flatnonzero(self.order != np.arange(len(self.order))).tolist()
+            found.append(Finding("exchanged_in_model", REFUSES, Subject(joints=(i + 1, j + 1))))
+        for i in np.flatnonzero(self.senses < 0).tolist():
+            unit = "m" if self.prismatic[i] else "rad"
+            found.append(Finding("other_sense", REFUSES, Subject(joints=(i + 1,)), unit=unit))
         zeros = np.where(self.prismatic, 0.0, self.zeros())
-        far = np.flatnonzero(np.abs(zeros) > _MAX_ZERO)
-        return words + [f"the zero of joint {i + 1} is off by {np.degrees(zeros[i]):.1f}°" for i in far]
+        for i in np.flatnonzero(np.abs(zeros) > _MAX_ZERO).tolist():
+            joint, off = Subject(joints=(i + 1,)), float(zeros[i])
+            found.append(Finding("far_zero", REFUSES, joint, off, limit=_MAX_ZERO, unit="rad"))
+        return found
 
-    def implausible(self) -> str:
-        """Describe the axis that is farthest beyond the errors of any model; empty if none is."""
+    def implausible(self) -> list[Finding]:
+        """Return the axis that is farthest beyond the errors of any model, if one is."""
         size, std = self.axis_errors()
         limit = np.array([_MAX_TILT, _MAX_OFFSET * float(np.linalg.norm(self._near))]) + _BEYOND * std
         i, kind = np.unravel_index(int(np.argmax(size / limit)), size.shape)
         if size[i, kind] <= limit[i, kind]:
-            return ""
-        unit, factor = (" mm", MM) if kind else ("°", float(np.degrees(1.0)))
-        deviation, allowed = factor * size[i, kind], factor * limit[i, kind]
-        return f"the axis of joint {i + 1} is off by {deviation:.3g}{unit}, {allowed:.3g}{unit} allowed"
+            return []
+        off, most, joint = float(size[i, kind]), float(limit[i, kind]), Subject(joints=(int(i) + 1,))
+        return [Finding("far_axis", REFUSES, joint, off, limit=most, unit="m" if kind else "rad")]
 
     def left(self, x: FloatArray, calibrated: FloatArray, factor: float = 1.0) -> FloatArray:
         """Differences (…, 6 n) of axes (…, n, 6) from those of the model, its lengths times a factor."""
@@ -202,7 +203,7 @@ def _model_fit(metric: Metric, model_axes: FloatArray) -> _ModelFit:
     Raises WorkFailed naming it, or the axis that is off, where the model does not describe the arm.
     """
     fit = _ModelFit(metric, model_axes).fitted()
-    wrong = fit.implausible() or " and ".join(fit.differences())
+    wrong = fit.implausible() or fit.differences()
     if not wrong and fit.chi2 <= _DOUBTED * len(fit.residual):
         return fit
     n = len(model_axes)
@@ -221,13 +222,11 @@ def _model_fit(metric: Metric, model_axes: FloatArray) -> _ModelFit:
     least = min((other.chi2 for other in fits), default=np.inf)
     equal = [other.differences() for other in fits if other.chi2 <= _EQUAL * least]
     fewest = min(map(len, equal), default=0)
-    best = sorted(" and ".join(words) for words in equal if len(words) == fewest)  # senses before zeros
+    best = sorted((found for found in equal if len(found) == fewest), key=lines)  # senses before zeros
     if fewest and (wrong or least < _DECISIVE * fit.chi2):
-        wrong = " (or, as the axes do not tell, ".join(best[:2]) + ")" * (len(best) > 1)
+        wrong = best[0] + [Finding("undecided_model", others=tuple(other)) for other in best[1:2]]
     if wrong:
-        raise WorkFailed(
-            f"the model does not describe the arm: {wrong}; mend it, or check --tip and the known length"
-        )
+        raise failed([Finding("other_model", REFUSES, others=tuple(wrong))])
     return fit
 
 

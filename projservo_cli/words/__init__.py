@@ -59,7 +59,7 @@ def failed(findings: Iterable[Finding], setup: Setup = _SETUP, begin: str = "", 
     return WorkFailed(f"{begin}{text(found, setup)}{end}", findings=found)
 
 
-def text(findings: Iterable[Finding], setup: Setup) -> str:
+def text(findings: Iterable[Finding], setup: Setup = _SETUP) -> str:
     """Return the lines on findings as one text."""
     return "; ".join(lines(findings, setup))
 

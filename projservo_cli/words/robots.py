@@ -68,7 +68,7 @@ ROBOTS: dict[str, Row] = (
             "no frame for {amount} ({limit} at most, cameras.reconnect_s): {unshown}",
             "look at its cable and hub",
         ),
-        unopened=("cannot be opened", "look at its name, cable and power"),
+        unopened=("{name} cannot be opened", "look at its name, cable and power"),
         no_device=("there is no {name}; devices: {devices}",),
         unreadable_device=("{name} may not be read", "sudo usermod -aG video $USER, then log in again"),
         second_node=(

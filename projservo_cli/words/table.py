@@ -5,18 +5,14 @@ from typing import NamedTuple
 
 from projservo_cli.findings import Finding
 from projservo_cli.records import TOOL, VIEWS, WORLD
-from projservo_cli.words import calibrations, monitoring, plans, robots, runs
+from projservo_cli.words import calibrations, monitoring, plans, robots, runs, validations
 from projservo_cli.words.rows import Row
 
-ROWS: dict[str, Row] = (
-    calibrations.OF_MODEL
-    | calibrations.CALIBRATION
-    | calibrations.REFUSALS
-    | plans.PLANS
-    | monitoring.FAULTS
-    | runs.REASONS
-    | robots.ROBOTS
+TABLES = (
+    *(calibrations.OF_MODEL, calibrations.CALIBRATION, calibrations.REFUSALS),
+    *(validations.VALIDATIONS, plans.PLANS, monitoring.FAULTS, runs.REASONS, robots.ROBOTS),
 )
+ROWS: dict[str, Row] = {code: row for rows in TABLES for code, row in rows.items()}
 _ON_THE_TOOL = calibrations.ON_THE_TOOL | monitoring.ON_THE_TOOL
 
 

@@ -264,6 +264,13 @@ def _within(told: Told) -> str:
     return f", which show the tool within {quantity(told.one.amount, 'm', 2)} of where its joints put it"
 
 
+def _model_errors(told: Told) -> str:
+    """Join what is off in a model, and what else it may be."""
+    *words, last = told.others("sentence")
+    undecided = told.one.others[-1].code == "undecided_model"
+    return f"{' and '.join(words)} {last}" if undecided else " and ".join((*words, last))
+
+
 VALUES: dict[str, Callable[[Told], object]] = {
     # Of the subject.
     "of": lambda told: told.subject.joints,
@@ -407,6 +414,14 @@ VALUES: dict[str, Callable[[Told], object]] = {
     "within": _within,
     "found": lambda told: "; ".join(told.others("sentence")),
     "views_off": lambda told: "".join(f"; {said}" for said in told.others("sentence")),
+    # Of two views that number differently, and of a model.
+    "of_markers": lambda told: told.subject.markers,
+    "pairs": lambda told: "; ".join(told.others("sentence")[:_EXAMPLES]),
+    "begins": lambda told: (
+        f": its corners begin {told.one.amount:.0f} further in the right view" if told.one.amount else ""
+    ),
+    "turns": lambda told: "slides" if told.one.unit == "m" else "turns",
+    "model_errors": _model_errors,
     # Of arms of one joint, and of several.
     "elsewhere": lambda told: "markers farther from its axis" if told.alone else "trials of every joint",
     "by_itself": lambda told: "" if told.alone else f" in which {told['it']} moves alone",

@@ -12,8 +12,10 @@ from scipy.sparse.csgraph import connected_components
 from projservo_cli.calibration.detections import Detections, beginning_in
 from projservo_cli.calibration.epipolar import OUTLIER, Epipolar, ImageFrame, ImageGeometry, sampson
 from projservo_cli.calibration.single_view import RigidBody
+from projservo_cli.findings import REFUSES, Finding, Subject
 from projservo_cli.geometry.displacements import homogeneous
 from projservo_cli.records import BoolArray, FloatArray, IntArray, Observation, WorkFailed
+from projservo_cli.words import failed
 
 # Minimum number of poses at which both views saw a marker, to judge its number.
 _MIN_POSES = 8
@@ -87,11 +89,8 @@ def _require_one_pose(detections: Detections, noise_px: float) -> None:
             shifted_px = Epipolar.of(shifted, np.random.default_rng(0)).sigma_px
         if shifted_px < limit_px:
             names = [detections.view[v] for v in detections.pair]
-            raise WorkFailed(
-                f"each {names[late]} image shows the pose before that of the {names[1 - late]} one, by the "
-                "epipolar geometry: let each pose settle for longer (plant.settle_s), and take the newest "
-                "frame of both cameras"
-            )
+            subject = Subject(views=(names[late], names[1 - late]))
+            raise failed([Finding("late_view", REFUSES, subject, shifted_px, limit=limit_px, unit="px")])
 
 
 def _require_one_rig(detections: Detections) -> None:
@@ -101,10 +100,8 @@ def _require_one_rig(detections: Detections) -> None:
         count = beginning_in(_misfitting(detections, half)[:: -1 if backwards else 1])
         if count >= _LEAST_MOVED:
             at, which = (-count, "last") if backwards else (count, "first")
-            raise WorkFailed(
-                f"one camera moved at pose {detections.pose[at]}, by the epipolar geometry: record again, or "
-                f"remove the {which} {count} poses"
-            )
+            subject = Subject(poses=(int(detections.pose[at]),), name=which)
+            raise failed([Finding("camera_amid", REFUSES, subject, count, unit="1")])
 
 
 def _misfitting(detections: Detections, half: BoolArray) -> BoolArray:
@@ -126,26 +123,23 @@ def _require_alike(detections: Detections, order: IntArray) -> None:
         return
     number = detections.marker
     pairs = [(int(number[i]), int(number[order[i]])) for i in moved]
-    raise WorkFailed(
-        f"both views number {moved.size} markers differently at all poses, by the epipolar geometry: "
-        f"{'; '.join(_words(pairs)[:_EXAMPLES])}; number them alike in both views (the images do not tell "
-        "which view is right), or remove them"
-    )
+    found = tuple(_exchanged(pairs))
+    raise failed([Finding("other_numbers", REFUSES, amount=moved.size, unit="1", others=found)])
 
 
-def _words(pairs: list[tuple[int, int]]) -> list[str]:
-    """Describe numbers in the left view and in the right one, by tags where they are whole tags."""
-    right, words, rest = dict(pairs), [], []
+def _exchanged(pairs: list[tuple[int, int]]) -> list[Finding]:
+    """Return numbers in the left view and in the right one, by tags where they are whole tags."""
+    right, found, rest = dict(pairs), [], []
     for left, other in pairs:
         t, u = left // _CORNERS, other // _CORNERS
         here = [right.get(_CORNERS * t + k, -1) - _CORNERS * u for k in range(_CORNERS)]
         turn = here[0]
         if here != [(turn + k) % _CORNERS for k in range(_CORNERS)]:
-            rest.append(f"marker {left} left is marker {other} right")
+            rest.append(Finding("exchanged_numbers", subject=Subject(markers=(left, other))))
         elif left % _CORNERS == 0:
-            by = f"its corners begin {-turn % _CORNERS} further in the right view" if turn else "not turned"
-            words.append(f"tag {t}: {by}" if t == u else f"tag {t} left is tag {u} right, {by}")
-    return [*words, *rest]
+            code = "begun_tag" if t == u else "exchanged_tag"
+            found.append(Finding(code, subject=Subject(markers=(t, u)), amount=-turn % _CORNERS))
+    return [*found, *rest]
 
 
 def _by_tags(detections: Detections) -> IntArray:

@@ -1,7 +1,7 @@
 """Predictions of poses that no fit has seen: cross-validation, and another recording."""
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from typing import Any
@@ -16,6 +16,7 @@ from projservo_cli.calibration.detections import SAME_READING, Detections, per_r
 from projservo_cli.calibration.epipolar import Epipolar
 from projservo_cli.calibration.prediction import joint_derivative, predict, prediction_variance
 from projservo_cli.calibration.robust_fit import WARN_RATIO, Solution, fit_inliers
+from projservo_cli.findings import LIMITS, NOTE, Finding, Subject
 from projservo_cli.geometry.lens import undistort
 from projservo_cli.records import (
     VIEWS,
@@ -28,12 +29,12 @@ from projservo_cli.records import (
     Observation,
     WorkFailed,
 )
-from projservo_cli.words import lines, setup_of
+from projservo_cli.words import lines, setup_of, text
 
 # Minimum number of parts in a cross-validation.
 _MIN_FOLDS = 2
 # Divisions of the poses into blocks besides a random one, and the cause of a larger error there.
-_BLOCKS = {"posture": "the model errs between postures", "time": "something changed over the recording"}
+_BLOCKS = "posture", "time"
 # Held-out over predicted error in blocks, over that of random parts, from which it is named.
 _BLOCK_RATIO = 1.3
 # Held-out error of the other views with a camera over that without, from which it spoils them.
@@ -85,7 +86,7 @@ def cross_validate(
     """
     detections = solution.problem.detections
     part, unit = _divide(detections, folds, np.random.default_rng(seed))
-    names, V = tuple(_BLOCKS) if blocks else (), len(detections.view)
+    names, V = _BLOCKS if blocks else (), len(detections.view)
     alone = range(V if blocks and len(VIEWS) < V else 0)  # cameras that are left out in turn
     total, done = folds * (1 + len(names) + len(alone)), 0
 
@@ -106,13 +107,15 @@ def cross_validate(
         of_blocks[f"{name}_rms_px"] = _distance_statistics(length[np.isfinite(length)])["rms_px"]
         of_blocks[f"{name}_predicted_px"] = _expected_px(spread)
     others = np.array([_of_others(solution, v, part, residual, sigma_px, on_fold) for v in alone])
-    spoilt = _describe_others(detections.view, others) if len(others) else ""
+    found = tuple(_on_held_out(statistics["rms_px"], expected, len(failed), of_blocks))
+    found += tuple(_on_others(detections.view, others)) if len(others) else ()
     return CrossValidation(
         folds=folds,
         seed=seed,
         unit=unit,
         failed=tuple(failed),
-        reason=_describe_held_out(statistics["rms_px"], expected, len(failed), of_blocks) + spoilt,
+        reason=text(found),
+        findings=found,
         others_px=others if len(others) else None,
         **statistics,
         predicted_rms_px=expected,
@@ -152,18 +155,17 @@ def _of_others(
     return np.sqrt(squares.mean(axis=1)) if squares.size else np.full(2, np.nan)
 
 
-def _describe_others(view: tuple[str, ...], others: FloatArray) -> str:
-    """Name the camera without which the others (V, 2) are predicted best, or say that none spoils them."""
+def _on_others(view: tuple[str, ...], others: FloatArray) -> Iterator[Finding]:
+    """Name the camera without which the others (V, 2) are predicted best, or tell that none spoils them."""
     if not np.isfinite(others).any():
-        return ""
+        return
     gain = others[:, 0] / others[:, 1]
     v = int(np.nanargmax(gain))
+    subject, (with_it, without) = Subject(views=(view[v],)), others[v].tolist()
     if gain[v] < _SPOILS:
-        return f"; no camera spoils the others: without {view[v]} they err {1.0 / gain[v]:.3g} times as much"
-    return (
-        f"; leave out the {view[v]} camera: the others err {others[v, 0]:.3g} px rms with it, "
-        f"{others[v, 1]:.3g} px without"
-    )
+        yield Finding("no_spoiling_camera", NOTE, subject, float(1.0 / gain[v]), limit=_SPOILS)
+    else:
+        yield Finding("spoiling_camera", LIMITS, subject, with_it, limit=without, unit="px")
 
 
 def _expected_px(predicted: FloatArray) -> float | None:
@@ -268,22 +270,23 @@ def _held_out_residuals(
     return solution.used & place, difference, error
 
 
-def _describe_held_out(
+def _on_held_out(
     rms: float | None, expected: float | None, failed: int, blocks: Mapping[str, Any]
-) -> str:
-    """Describe how the held-out error compares with the predicted one, and where blocks of poses err more."""
+) -> Iterator[Finding]:
+    """Tell how the held-out error compares with the predicted one, and where blocks of poses err more."""
     if rms is None or expected is None:
-        return "no part could be predicted from the others: record more poses"
-    lost = f"; {failed} parts could not be predicted from the others: record more poses" if failed else ""
+        yield Finding("nothing_held_out", LIMITS)
+        return
+    yield Finding("held_out", NOTE, amount=rms, limit=expected, unit="px")
     ratio = rms / expected
-    meaning = ""
     if ratio > WARN_RATIO:
-        meaning = ": the poses disagree by more than noise, as from joint readings or a lens"
-    for name, cause in _BLOCKS.items():
+        yield Finding("poses_disagree", LIMITS, amount=ratio, limit=WARN_RATIO)
+    if failed:
+        yield Finding("parts_lost", LIMITS, amount=failed, unit="1")
+    for name in _BLOCKS:
         apart, predicted = blocks.get(f"{name}_rms_px"), blocks.get(f"{name}_predicted_px")
         if apart is not None and predicted is not None and apart > _BLOCK_RATIO * max(ratio, 1.0) * predicted:
-            lost += f"; in blocks of {name} {apart / predicted:.3g} times: {cause}"
-    return f"held-out images err {ratio:.3g} times as much as the covariance predicts{meaning}{lost}"
+            yield Finding(f"{name}_blocks", LIMITS, amount=apart / predicted, limit=_BLOCK_RATIO)
 
 
 def residual_statistics(calibration: Calibration, observation: Observation) -> dict[str, Any]:

@@ -1,0 +1,56 @@
+"""Words for predictions held against further images: parts left out, a camera fitted again, two views."""
+
+from projservo_cli.words.rows import Row
+
+_MORE = "record more poses"
+_CHECK = "check the joint readings and the marker numbers"
+VALIDATIONS = {
+    "held_out": Row("held-out images err {ratio} times as much as the covariance predicts"),
+    "poses_disagree": Row("the poses disagree by more than noise, as from joint readings or a lens"),
+    "parts_lost": Row("{count} parts could not be predicted from the others", _MORE),
+    "nothing_held_out": Row("no part could be predicted from the others", _MORE),
+    "posture_blocks": Row("in blocks of posture {amount} times: the model errs between postures"),
+    "time_blocks": Row("in blocks of time {amount} times: something changed over the recording"),
+    "spoiling_camera": Row(
+        "the others err {amount} rms with the {view} camera, {limit} without", "leave it out"
+    ),
+    "no_spoiling_camera": Row("no camera spoils the others: without {view} they err {amount} times as much"),
+    "refit_outliers": Row(
+        "{count} of {total} detections of the {view} camera do not fit ({rest} allowed)", _CHECK
+    ),
+    "refit_slip": Row(
+        "by the images, {joints} is {size} off its readings, which moves images by {part} times their noise "
+        "({of_part} allowed)",
+        "home it, or calibrate again",
+    ),
+    "refit_misfit": Row(
+        "the images are {amount} times as far off as noise and covariance explain ({limit} allowed)", _CHECK
+    ),
+    "refit_unnoticed": Row(
+        "an error of {joints} by {amount} could pass into the {view} camera unnoticed ({limit} allowed)",
+        "add poses that spread farther, or images of a camera that did not move",
+    ),
+    "late_view": Row(
+        "each {view} image shows the pose before that of the {other_view} one, by the epipolar geometry",
+        "let each pose settle for longer (plant.settle_s), and take the newest frame of both cameras",
+    ),
+    "camera_amid": Row(
+        "one camera moved at pose {poses}, by the epipolar geometry",
+        "record again, or remove the {name} {count} poses",
+    ),
+    "other_numbers": Row(
+        "both views number {count} markers differently at all poses, by the epipolar geometry: {pairs}",
+        "number them alike in both views (the images do not tell which view is right), or remove them",
+    ),
+    "exchanged_numbers": Row("marker {of_markers[0]} left is marker {of_markers[1]} right"),
+    "exchanged_tag": Row("tag {of_markers[0]} left is tag {of_markers[1]} right{begins}"),
+    "begun_tag": Row("tag {of_markers[0]}{begins}"),
+    "exchanged_in_model": Row("{joints} have each other's place in the model"),
+    "other_sense": Row("{joints} {turns} the other way in the model"),
+    "far_zero": Row("the zero of {joints} is off by {amount}"),
+    "far_axis": Row("the axis of {joints} is off by {amount}, {limit} allowed"),
+    "other_model": Row(
+        "the model does not describe the arm: {model_errors}", "mend it, or check --tip and the known length"
+    ),
+    "undecided_model": Row("(or, as the axes do not tell, {model_errors})"),
+}
