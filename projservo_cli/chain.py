@@ -30,7 +30,7 @@ from projservo_cli.settings.task import TaskStep
 from projservo_cli.stages.stage_inputs import CarryingObject, PlanInputs, ServoInputs
 from projservo_cli.store.run_file import SERVO, Run, save
 from projservo_cli.words import line
-from projservo_cli.words.runs import arrived, meaning
+from projservo_cli.words.reasons import arrived, meaning
 from projservo_cli.words.table import Setup
 
 if TYPE_CHECKING:

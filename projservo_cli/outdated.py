@@ -27,7 +27,7 @@ from projservo_cli.result_hashes import key_of
 from projservo_cli.robots.source import source_hash
 from projservo_cli.settings.task import TaskStep
 from projservo_cli.store.run_file import SERVO, Result, Run
-from projservo_cli.words.runs import meaning
+from projservo_cli.words.reasons import meaning
 
 # The stages in their order, and what makes the record that each is given.
 _INPUTS: dict[str, Callable[[Config, Files | None], Any]] = {

@@ -19,7 +19,7 @@ from projservo_cli.config.schema import json_schema, sweep_schema
 from projservo_cli.loop import verdicts as loop_verdicts
 from projservo_cli.sweeps.runs import BETWEEN, NUMBERED, measured_columns
 from projservo_cli.words import ROWS
-from projservo_cli.words.runs import VERDICTS
+from projservo_cli.words.reasons import VERDICTS
 
 # Where a run file holds which record.
 GROUPS = {

@@ -31,7 +31,7 @@ from projservo_cli.loop.verdicts import (
 )
 from projservo_cli.records import FloatArray, Plan
 from projservo_cli.task.face import Task
-from projservo_cli.words.runs import VERDICTS
+from projservo_cli.words.reasons import VERDICTS
 
 # Periods between checks of the path ahead, by the mean offset of the images in the last ones.
 _EVERY, _LAST = 10, 5

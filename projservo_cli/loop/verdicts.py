@@ -29,7 +29,7 @@ from projservo_cli.geometry.jit import merged
 from projservo_cli.geometry.kinematics import beyond_limits, from_border
 from projservo_cli.records import VIEWS, FloatArray, IntArray
 from projservo_cli.simulation.analytic_plant import Plant
-from projservo_cli.words.runs import VERDICTS
+from projservo_cli.words.reasons import VERDICTS
 
 RUNNING = -1
 WAITING = -3  # for lost markers; no verdict of a run

@@ -10,7 +10,7 @@ from projservo_cli.calibration.detections import even_choice
 from projservo_cli.calibration.prediction import CAMERA, predict
 from projservo_cli.findings import REFUSES, Finding, Subject
 from projservo_cli.monitoring.accuracy import Posture
-from projservo_cli.monitoring.faults import finding_of, group_of, is_slight
+from projservo_cli.monitoring.causes import finding_of, group_of, is_slight
 from projservo_cli.monitoring.frame_pairs import FramePair, Pairing, TimedImage, at_known_markers, mean_image
 from projservo_cli.monitoring.hypotheses import (
     Evidence,

@@ -31,7 +31,7 @@ from projservo_cli.report.report_data import PAGE_FILE, title
 from projservo_cli.simulation.analytic_plant import Plant
 from projservo_cli.simulation.arm import SerialArm
 from projservo_cli.task.face import center_of
-from projservo_cli.words.runs import arrived
+from projservo_cli.words.reasons import arrived
 
 _MOST_INSTANTS = 60
 _DOTS = 9  # on the planned path

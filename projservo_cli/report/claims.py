@@ -21,7 +21,7 @@ from projservo_cli.report.report_data import (
     curve_difference,
     percent,
 )
-from projservo_cli.words.runs import arrived
+from projservo_cli.words.reasons import arrived
 from projservo_cli.words.values import joined
 
 

@@ -32,7 +32,7 @@ from projservo_cli.report.report_data import (
 )
 from projservo_cli.report.style import FORMATS
 from projservo_cli.store.run_file import Run
-from projservo_cli.words.runs import arrived
+from projservo_cli.words.reasons import arrived
 
 
 def _calibration_words(values: Mapping[str, Any], *, estimated: bool) -> Iterator[str]:

@@ -76,7 +76,7 @@ from projservo_cli.task.incidences import (
 )
 from projservo_cli.task.target import TaskImages, followed
 from projservo_cli.words import line, lines, order_advice, text
-from projservo_cli.words.runs import VERDICTS, arrived
+from projservo_cli.words.reasons import VERDICTS, arrived
 from projservo_cli.words.table import Setup
 from projservo_cli.words.values import all_of
 

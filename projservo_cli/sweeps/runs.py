@@ -34,7 +34,7 @@ from projservo_cli.stages.stage_inputs import PlanInputs, ServoInputs
 from projservo_cli.store.sweep_table import Failure, Heading, merge_failures
 from projservo_cli.sweeps.design import RUNS, Design, name_of_run
 from projservo_cli.words import line
-from projservo_cli.words.runs import VERDICTS
+from projservo_cli.words.reasons import VERDICTS
 
 _NOT_CALIBRATED, _NOT_STARTED = "not calibrated", "not started"
 # Reason of a compiled run that did not start.

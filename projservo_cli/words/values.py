@@ -7,7 +7,7 @@ import numpy as np
 
 from projservo_cli.findings import NOTE, Finding, Subject
 from projservo_cli.records import CORNERS, LIMITS_MISSING, TOOL
-from projservo_cli.words.runs import because
+from projservo_cli.words.reasons import because
 from projservo_cli.words.table import Setup, row_of
 
 # Maximum number of names in a list of examples, and of runs of poses.
