@@ -1,6 +1,7 @@
 """Commands on data of robots and cameras: ``teach``, ``detect`` and ``validate``."""
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -359,10 +360,10 @@ def _validate(
         raise click.UsageError("--data and --metric: validate takes one of them; leave the other out")
     from projservo_cli.calibration.checks.validation import residual_statistics
     from projservo_cli.config import load_config
-    from projservo_cli.records import WorkFailed
+    from projservo_cli.findings import REFUSES
     from projservo_cli.store.observation_tables import read_detections, read_table
     from projservo_cli.store.run_file import load
-    from projservo_cli.words import order_advice
+    from projservo_cli.words import failed, order_advice, setup_of
 
     found = load(target)
     calibration = found.calibration
@@ -403,30 +404,22 @@ def _validate(
         "images, {noise_px:.3g} px, together".format_map(value)
     )
     words.append(wrapped(f"median {allowed}", "  "))
-    beyond = [one for one in value["views"] if one["count"] and one["median_px"] > one["limit_px"]]
-    of_view = "{view} camera: median {median_px:.3g} px of {count} pairs, {limit_px:.3g} px allowed"
-    if beyond:
+    refusing = [one for one in value["findings"] if one.severity == REFUSES]
+    if refusing:
+        of_view = "{view} camera: median {median_px:.3g} px of {count} pairs, {limit_px:.3g} px allowed"
         words += [wrapped(of_view.format_map(one), "  ") for one in value["views"] if one["count"]]
     console.report(value, words)
-    if not beyond and value["median_px"] <= value["limit_px"]:
+    if not refusing:
         return
-    reason = "the images contradict the calibration"
-    remedy = (
-        "check that these are the same robot, rig and markers, with joints in the same units; if so, "
-        "calibrate again with such poses among the others"
-    )
-    passed = f"median {value['median_px']:.3g} px, {allowed}"
-    if value["median_px"] <= value["limit_px"] or len(beyond) < len(value["views"]):
-        passed = "; ".join(map(of_view.format_map, beyond)) or passed
-    if 0 < len(beyond) < len(value["views"]):
-        moved, *others = (one["view"] for one in beyond)
-        remedy = f"if it moved, fit it again: projservo calibrate {target} --refit {moved} --data {data}"
-        reason += " in some cameras alone" if others else " in one camera alone"
+    (one,) = refusing
+    again = f"projservo calibrate {target} --refit {''.join(one.subject.views[:1])} --data {data}"
+    one = replace(one, subject=replace(one.subject, name=again))
     left_open, n = order_advice(calibration), len(calibration.joint_types)
     order = calibration.undecided_order
     if order is not None and order.size == n * (n - 1):  # all reversed is the other mount
         left_open += "; no pose shows whether the cameras are on the tool (--mount) either"
-    raise WorkFailed("; ".join(filter(None, (f"{data}: {reason}: {passed}", remedy, left_open))))
+    left_open = f"; {left_open}" if left_open else ""
+    raise failed([one], setup_of(calibration), f"{data}: ", left_open)
 
 
 def _position_errors(

@@ -15,6 +15,16 @@ VALIDATIONS = {
         "the others err {amount} rms with the {view} camera, {limit} without", "leave it out"
     ),
     "no_spoiling_camera": Row("no camera spoils the others: without {view} they err {amount} times as much"),
+    "contradicted": Row(
+        "the images contradict the calibration: {medians}",
+        "check that these are the same robot, rig and markers, with joints in the same units; if so, "
+        "calibrate again with such poses among the others",
+    ),
+    "contradicted_in_part": Row(
+        "the images contradict the calibration in {part_of_cameras}: {unshown}",
+        "if it moved, fit it again: {name}",
+    ),
+    "contradicted_view": Row("{view} camera: median {amount}, {limit} allowed"),
     "refit_outliers": Row(
         "{count} of {total} detections of the {view} camera do not fit ({rest} allowed)", _CHECK
     ),

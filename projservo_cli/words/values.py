@@ -271,6 +271,16 @@ def _model_errors(told: Told) -> str:
     return f"{' and '.join(words)} {last}" if undecided else " and ".join((*words, last))
 
 
+def _medians(told: Told) -> str:
+    """Say which medians pass their limits: of each view, else of all together."""
+    if told.rest.code == "contradicted_view":
+        return "; ".join(told.others("sentence"))
+    return (
+        f"median {told['amount']}, {told['limit']} allowed: 3 times the stated error of {told['part']} and "
+        f"the noise of these images, {told['of_part']}, together"
+    )
+
+
 VALUES: dict[str, Callable[[Told], object]] = {
     # Of the subject.
     "of": lambda told: told.subject.joints,
@@ -415,6 +425,8 @@ VALUES: dict[str, Callable[[Told], object]] = {
     "found": lambda told: "; ".join(told.others("sentence")),
     "views_off": lambda told: "".join(f"; {said}" for said in told.others("sentence")),
     # Of two views that number differently, and of a model.
+    "part_of_cameras": lambda told: {1: "one camera alone"}.get(len(told.subject.views), "some cameras"),
+    "medians": _medians,
     "of_markers": lambda told: told.subject.markers,
     "pairs": lambda told: "; ".join(told.others("sentence")[:_EXAMPLES]),
     "begins": lambda told: (

@@ -151,7 +151,11 @@ def statistics(monkeypatch):
         ],
         "skipped": {"unknown_marker": 1, "behind_camera": 0, "missing": 3},
     }
-    monkeypatch.setattr(validation, "residual_statistics", lambda *_: value)
+
+    def found(*_):
+        return value | {"findings": tuple(validation.contradictions(value))}
+
+    monkeypatch.setattr(validation, "residual_statistics", found)
     return value
 
 

@@ -16,7 +16,7 @@ from projservo_cli.calibration.detections import SAME_READING, Detections, per_r
 from projservo_cli.calibration.epipolar import Epipolar
 from projservo_cli.calibration.prediction import joint_derivative, predict, prediction_variance
 from projservo_cli.calibration.robust_fit import WARN_RATIO, Solution, fit_inliers
-from projservo_cli.findings import LIMITS, NOTE, Finding, Subject
+from projservo_cli.findings import LIMITS, NOTE, REFUSES, Finding, Subject
 from projservo_cli.geometry.lens import undistort
 from projservo_cli.records import (
     VIEWS,
@@ -298,7 +298,8 @@ def residual_statistics(calibration: Calibration, observation: Observation) -> d
     error that the covariance states at these readings, ``noise_px`` of these images and readings, and
     ``limit_px`` of the median by both (None without a covariance); ``views``, the ``view``, ``count``,
     ``median_px`` and ``limit_px`` of each; ``skipped``, the numbers of pairs of unknown markers, behind the
-    camera, and missing; ``advice`` about placeholders, which are missing ones.
+    camera, and missing; ``advice`` about placeholders, which are missing ones;
+    ``findings``, on these and on medians beyond their limits.
     Raises InputError if the readings have another number of joints or are not finite.
     """
     observation = of_views(observation.at_rest, calibration.view)
@@ -334,7 +335,7 @@ def residual_statistics(calibration: Calibration, observation: Observation) -> d
         for v in np.flatnonzero(compared.any(axis=(0, 2))).tolist():
             variances = (float(np.median(part[:, v][compared[:, v]])) for part in (of_pairs, of_readings))
             limits[v] = _limit_of_view(off[:, v], max(of_images, float(np.sqrt(2.0) * own[v])), *variances)
-    return found | {
+    found |= {
         "stated_px": stated,
         "noise_px": noise,
         "limit_px": limit,
@@ -349,6 +350,26 @@ def residual_statistics(calibration: Calibration, observation: Observation) -> d
         },
         "advice": list(lines(told, setup_of(calibration))),
     }
+    return found | {"findings": (*told, *contradictions(found))}
+
+
+def contradictions(found: Mapping[str, Any]) -> Iterator[Finding]:
+    """Tell by the statistics of residuals whether a median passes its limit: of some views, or of all."""
+    stated, noise, limit, median = (found[f"{name}_px"] for name in ("stated", "noise", "limit", "median"))
+    if limit is None:
+        return
+    beyond = tuple(
+        Finding("contradicted_view", LIMITS, Subject((), (one["view"],)), off, limit=most, unit="px")
+        for one in found["views"]
+        for off, most in [(one["median_px"], one["limit_px"])]
+        if one["count"] and most is not None and off > most
+    )
+    if 0 < len(beyond) < len(found["views"]):
+        views = tuple(view for one in beyond for view in one.subject.views)
+        yield Finding("contradicted_in_part", REFUSES, Subject(views=views), others=beyond)
+    elif beyond or median > limit:
+        parts = (Finding("noise", amount=stated, limit=noise, unit="px"),) if median > limit else beyond
+        yield Finding("contradicted", REFUSES, amount=median, limit=limit, unit="px", others=parts)
 
 
 def _limit_of_view(off: FloatArray, noise: float, stated: float, of_readings: float) -> float:
