@@ -1,19 +1,9 @@
 """One period of the loop without the law: limits, counting, verdict.
 
-Precedence of the verdicts of ``verdict_at`` at one instant, first match wins; ``loop.python`` states what
-rules before and after it:
-
-1. ``behind camera``: a marker is not in front of a camera.
-2. ``out of view``: a marker is outside an image and ``image_border`` is stop.
-3. ``markers lost``: the law needs a marker that was not seen.
-4. ``converged``: the image error is within the tolerance.
-5. ``diverged``: the image error or the distance of the face exceeds its first value by the factor,
-   or the command is not finite.
-6. ``singular``: the joint motion of the law is not unique.
-7. ``no progress``, ``max steps``: no step is left; no progress if the error fell by less than 1 % in
-   the last window.
-8. ``joint limit``: a joint stands at its limit, the command would take it beyond, and ``joint_limits``
-   is stop. A command that would pass a limit is shortened to end there.
+Of several verdicts at one instant ``verdict_at`` gives the first of ``behind camera``, ``out of view``,
+``markers lost``, ``converged``, ``diverged``, ``singular``, ``no progress`` or ``max steps``, and ``joint
+limit``; ``loop.python`` states what rules before and after it. ``words.reasons`` has their causes. A command
+that would pass a limit is shortened to end there.
 
 While markers are lost the robot is held where it is for up to ``max_lost_periods`` periods in a row; the run
 goes on when they are seen again.
