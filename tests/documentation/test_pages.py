@@ -313,7 +313,8 @@ def test_messages_of_the_troubleshooting_page_stand_in_the_sources():
         path.read_text(encoding="utf-8") for path in sorted((ROOT / "projservo_cli").rglob("*.py"))
     )
     joined = re.sub(r'["\']\s*(?:\+ )?f?["\']', "", sources)
-    joined += " ".join(f"{row.sentence}{by} {row.remedy}" for row in ROWS.values() for by in ":;")
+    rows = " ".join(f"{row.sentence}{by} {row.remedy}" for row in ROWS.values() for by in ":;")
+    joined += rows + re.sub(r"\{\w+\}", "… px", rows)
     rows = [line.split("|") for line in PAGES["troubleshoot"].read_text(encoding="utf-8").splitlines()]
     said = [piece for row in rows if len(row) == 5 for piece in re.findall(r"`([^`]*)`", row[2])]
     pieces = [part.strip() for piece in said for part in piece.split("…") if part.strip()]
