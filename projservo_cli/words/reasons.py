@@ -67,7 +67,7 @@ _REPLANNED = {
 }
 REASONS = {
     "converged": Row("{name} {amount} is within {limit}"),
-    "no_progress": Row("no progress at an {name} of {amount}: {causes}"),
+    "no_progress": Row("the {name} stays at {amount}: {causes}"),
     "max_steps": Row("no step left; {name} {amount} was still changing"),
     "error_grew": Row("{name} {amount} is more than {part} times that at first, {limit}"),
     "face_left": Row("the face is {amount} from the cameras, over {part} times the {limit} at first"),
