@@ -72,8 +72,8 @@ _CHANCE = 1e-3
 _MORE = 1.5
 # Standard deviations from which the offset of a joint is one, or passes unnoticed below.
 _SURE = 4.0
-# Effect of an offset of a joint on images, over their noise, from which it matters.
-_MATTERS = 3.0
+# Effect of an offset of a joint on images, over their noise, from which it matters: below it hides in noise.
+_MATTERS = 1.0
 # Largest offset of a joint, rad (prismatic × 0.3 m/rad), that may pass into the camera unnoticed.
 _UNNOTICED_RAD = np.radians(1.0)
 # Share of the square of a joint's effect below which the camera can move images alike.
