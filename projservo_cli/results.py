@@ -230,7 +230,7 @@ class ImageModel(Displayable, Calibration):
         None without a pair; ``stated_px``, the median error that the covariance states there, ``noise_px`` of
         these images, and ``limit_px``, three times both together, above which the median contradicts the
         calibration; ``views``, with the ``view``, ``count``, ``median_px`` and ``limit_px`` of each, which
-        show a camera that moved; ``skipped`` by why.
+        show a camera that moved; ``skipped`` by why; ``findings``, one that refuses where a limit is passed.
 
         Raises
         ------

@@ -153,7 +153,7 @@ def statistics(monkeypatch):
     }
 
     def found(*_):
-        return value | {"findings": tuple(validation.contradictions(value))}
+        return value | {"findings": [*validation.contradictions(value)]}
 
     monkeypatch.setattr(validation, "residual_statistics", found)
     return value

@@ -350,7 +350,7 @@ def residual_statistics(calibration: Calibration, observation: Observation) -> d
         },
         "advice": list(lines(told, setup_of(calibration))),
     }
-    return found | {"findings": (*told, *contradictions(found))}
+    return found | {"findings": [*told, *contradictions(found)]}
 
 
 def contradictions(found: Mapping[str, Any]) -> Iterator[Finding]:
