@@ -29,7 +29,7 @@ from projservo_cli.result_hashes import digest
 from projservo_cli.settings.task import TaskStep
 from projservo_cli.stages.stage_inputs import CarryingObject, PlanInputs, ServoInputs
 from projservo_cli.store.run_file import SERVO, Run, save
-from projservo_cli.words import line
+from projservo_cli.words import failed, line, lines
 from projservo_cli.words.reasons import arrived, meaning
 from projservo_cli.words.table import Setup
 
@@ -194,7 +194,7 @@ class Chain:
                 elif not arrived(trace.verdict) and step.part:  # nor are the next steps made
                     self._fail(step, f"ended in {trace.verdict}: {trace.reason}")
                 elif self.session is not None and (lost := self.session.lost):
-                    self._fail(step, lost)
+                    self._fail(step, failed([lost]))
             if self.failed:
                 return
 
@@ -244,7 +244,7 @@ class Chain:
         """Say what stays as it was sent, and which steps of the sequence were not begun."""
         names = list(self.config.steps)
         rest = names[names.index(step.part) + 1 :]
-        kept = "" if self.session is None else self.session.kept
+        kept = "" if self.session is None else ", ".join(lines(self.session.kept))
         begun = f"{', '.join(rest)} {'was' if len(rest) == 1 else 'were'} not begun" if rest else ""
         return "".join(
             f"; {text}" for text in (kept, begun, "the sequence begins again at its first step") if text

@@ -148,7 +148,7 @@ class StallMonitor:
 
     def _unit(self, i: int) -> str:
         """Return the unit of joint i."""
-        return "m" if self._robot.robot.bounds.units[i : i + 1] == ("m",) else "rad"
+        return self._robot.robot.bounds.unit(i)
 
     def _staying(self, stays: BoolArray) -> Finding:
         """Return the joint that stays where it is however far its set-point goes."""

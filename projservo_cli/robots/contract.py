@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from projservo_cli.calibration.time_offset import is_repeated_frame, time_unit
-from projservo_cli.findings import LIMITS, Finding, Subject
+from projservo_cli.findings import LIMITS, REFUSES, Finding, Subject
 from projservo_cli.image_size import ImageSize, image_sizes
 from projservo_cli.plugins import what_failed
 from projservo_cli.records import (
@@ -27,6 +27,7 @@ from projservo_cli.records import (
     WorkFailed,
     in_unit,
 )
+from projservo_cli.words import failed
 
 # Time a robot has to come to rest, and then to be closed, s; until then not even Ctrl-C ends the waiting.
 STOP_S = 10.0
@@ -90,24 +91,28 @@ class Bounds(NamedTuple):
         """Write a value of joint i, rad or m, in its unit."""
         return in_unit(value, self.units[i] if self.units else "rad or m", digits)
 
+    def unit(self, i: int) -> str:
+        """Return the unit of joint i in findings, rad or m."""
+        return "m" if self.units[i : i + 1] == ("m",) else "rad"
+
     def allowed(
         self, q: FloatArray, sent: FloatArray, seconds: float
     ) -> dict[str, tuple[FloatArray, FloatArray]]:
-        """Least and most (n,) that a set-point may be, by what is wrong with others.
+        """Least and most (n,) that a set-point may be, by the code of a finding on others.
 
         q : reading (n,); sent : (n,) the set-point before; seconds : since that was due, s.
         """
         step, lead = self.limits.speed * seconds, self.lead
         return {
-            "too far ahead of the reading": (q - lead, q + lead),
+            "set_point_ahead": (q - lead, q + lead),
             # Back towards the reading it may jump, which shortens the path of the robot, by what a robot
             # may be behind: a reading that is farther away is wrong.
-            "too far from the last one": (
+            "set_point_far": (
                 np.maximum(np.minimum(sent, q), sent - lead) - step,
                 np.minimum(np.maximum(sent, q), sent + lead) + step,
             ),
             # One beyond a limit may return.
-            "beyond its limits": (np.minimum(self.limits.lower, q), np.maximum(self.limits.upper, q)),
+            "set_point_passed": (np.minimum(self.limits.lower, q), np.maximum(self.limits.upper, q)),
         }
 
 
@@ -349,7 +354,7 @@ class PluginRobot:
     def command(self, target: FloatArray, speed: FloatArray, due: float) -> None:
         """Send the set-point (n,), rad or m, with its speed (n,), per s, and when it is due, s."""
         if wrong := self._wrong(target, speed, due):
-            raise WorkFailed(f"{self.name}: a command was not sent: {wrong}")
+            raise failed([wrong], begin=f"{self.name}: a command was not sent: ")
         sent = target.copy(), speed.copy(), due
         self._ask("command", lambda: self.robot.command(*sent))
         self._sent, self._due = target.copy(), due
@@ -543,13 +548,13 @@ class PluginRobot:
         """Return the time, s, from when the last command was due, at most a period ago, to another."""
         return max(0.0, due - max(self._due, self._shown[0] - self.bounds.period))
 
-    def _wrong(self, target: FloatArray, speed: FloatArray, due: float) -> str:
-        """Return the reason why a command must not be sent; empty if it may."""
+    def _wrong(self, target: FloatArray, speed: FloatArray, due: float) -> Finding | None:
+        """Return the reason why a command must not be sent; None if it may."""
         bounds = self.bounds
         if self._last is None:
-            return "nothing was read before"
+            return Finding("not_read", REFUSES)
         if not (np.isfinite(target).all() and np.isfinite(speed).all() and math.isfinite(due)):
-            return f"{target} at {speed} by {due} is not finite"
+            return Finding("not_finite_command", REFUSES)
         q = self._last.q
         sent = q if self._sent is None else self._sent
         # From the last set-point on, which after a pause was held: thinking took a period at most.
@@ -558,33 +563,33 @@ class PluginRobot:
         seconds = self.seconds_to(due)
         far = 2.0 * bounds.lead + bounds.limits.speed * seconds
         for i in np.flatnonzero(np.abs(q - sent) > far).tolist():
-            at, there = (bounds.text(i, values[i]) for values in (q, sent))
-            return f"joint {i + 1} reads {at} where its set-point is {there}: check its unit and its encoder"
+            return self._of_joint("reading_far", i, q[i], limit=sent[i])
         slack = _ROUND_OFF * (1.0 + np.abs(target))
-        for what, (low, high) in bounds.allowed(q, sent, seconds).items():
+        for code, (low, high) in bounds.allowed(q, sent, seconds).items():
             for i in np.flatnonzero((target < low - slack) | (target > high + slack)).tolist():
-                at, least, most = (bounds.text(i, values[i]) for values in (target, low, high))
-                return f"the set-point of joint {i + 1}, {at}, is {what}: allowed are {least} to {most}"
+                ends = (Finding("range", amount=low[i], limit=high[i], unit=bounds.unit(i)),)
+                return self._of_joint(code, i, target[i], others=ends)
         for i in np.flatnonzero(np.abs(speed) > bounds.limits.speed * (1.0 + _ROUND_OFF)).tolist():
-            at, most = (bounds.text(i, values[i]) for values in (speed, bounds.limits.speed))
-            return f"the speed of joint {i + 1}, {at}/s, is beyond its limit of {most}/s"
-        return ""
+            return self._of_joint("speed_passed", i, speed[i], limit=bounds.limits.speed[i])
+        return None
 
-    def _leap(self, before: Reading | None, now: Reading, sent: FloatArray) -> str:
-        """Return which joint read what it cannot have reached since the reading before; empty for none.
+    def _of_joint(self, code: str, i: int, amount: float, **more: Any) -> Finding:
+        return Finding(code, REFUSES, Subject(joints=(i + 1,)), amount, unit=self.bounds.unit(i), **more)
+
+    def _leap(self, before: Reading | None, now: Reading, sent: FloatArray) -> Finding | None:
+        """Return which joint read what it cannot have reached since the reading before; None for none.
 
         Towards the set-point (n,) it may leap: a reading that stood still for a while does.
         """
         if before is None:
-            return ""
+            return None
         seconds = max(now.t_q - before.t_q, self.bounds.period)
         far = _SURGE * self.bounds.limits.speed * seconds + self.bounds.sag + _LEAP
         leaps = (np.abs(now.q - before.q) > far) & (np.abs(now.q - sent) > np.abs(before.q - sent))
         for i in np.flatnonzero(leaps).tolist():
-            first, then = (self.bounds.text(i, reading.q[i]) for reading in (before, now))
-            what = f"joint {i + 1} read {first} and {then} within {seconds:.3g} s"
-            return f"{what}: check its encoder and unit, or what moved it"
-        return ""
+            first = Finding("first", amount=before.q[i], limit=seconds, unit=self.bounds.unit(i))
+            return self._of_joint("reading_leapt", i, now.q[i], others=(first,))
+        return None
 
     def _numbers(self, what: str, answer: Any, shape: tuple[int, ...], *, finite: bool = False) -> FloatArray:
         """The answer as new numbers of the right shape."""

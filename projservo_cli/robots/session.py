@@ -5,11 +5,12 @@ from contextlib import ExitStack
 from types import TracebackType
 from typing import Self
 
+from projservo_cli.findings import NOTE, REFUSES, Finding, Subject
 from projservo_cli.records import FloatArray, InputError, WorkFailed
 from projservo_cli.robots.contract import PluginRobot, at_rest_after
 from projservo_cli.robots.object_watch import LOOKS, ObjectWatch
 from projservo_cli.robots.pacing import Steered
-from projservo_cli.words import line
+from projservo_cli.words import failed, line
 from projservo_cli.words.table import Setup
 
 
@@ -70,8 +71,8 @@ class Session:
         self.held.pop(name, None)
         if takes is not None:
             self.held[name], self.at = takes.name, None
-        if self.lost:
-            raise WorkFailed(self.lost)
+        if (lost := self.lost) is not None:
+            raise failed([lost])
         return seconds
 
     def _require_there(self, watch: ObjectWatch) -> None:
@@ -93,12 +94,13 @@ class Session:
         return self.robot is not None and self.robot.holding(name) is False
 
     @property
-    def lost(self) -> str:
-        """Name the object that the tool should hold, by what was acted, and does not; empty for none."""
+    def lost(self) -> Finding | None:
+        """The object that the tool should hold, by what was acted, and does not; None for none."""
         for name, taken in self.held.items():
             if self.empty(name):
-                return f"the {name} holds nothing, and should hold the object {taken}: look where that lies"
-        return ""
+                part = Finding("object", subject=Subject(name=taken))
+                return Finding("dropped", REFUSES, Subject(name=name), others=(part,))
+        return None
 
     def hold(self, seconds: float) -> None:
         """Hold the set-point for so long, s."""
@@ -110,6 +112,6 @@ class Session:
             self.steered.hold()
 
     @property
-    def kept(self) -> str:
-        """Say what stays as it was sent, such as a grip; empty for nothing."""
-        return ", ".join(f"the {name} stays at {value:g}" for name, value in self.acted.items())
+    def kept(self) -> tuple[Finding, ...]:
+        """What stays as it was sent, such as a grip."""
+        return tuple(Finding("stays", NOTE, Subject(name=name), at) for name, at in self.acted.items())

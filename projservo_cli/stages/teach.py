@@ -206,8 +206,7 @@ def _require_still(bounds: Bounds, before: FloatArray, after: FloatArray, code: 
     off, most = np.abs(after - before), bounds.sag + _SLACK
     i = int(np.argmax(off / most))
     if off[i] > most[i]:
-        unit, joint = "m" if [*bounds.units][i : i + 1] == ["m"] else "rad", Subject(joints=(i + 1,))
-        found = Finding(code, REFUSES, joint, off[i], limit=most[i], unit=unit)
+        found = Finding(code, REFUSES, Subject(joints=(i + 1,)), off[i], limit=most[i], unit=bounds.unit(i))
         raise words.failed([found], begin="teach: ", end="; nothing was written")
 
 

@@ -182,7 +182,7 @@ ROBOTS: dict[str, Row] = (
             "look what pulls at it",
         ),
         stands_beyond=(
-            "nothing was moved: {servo} stands at {amount}, beyond its limits {part} to {of_part}",
+            "nothing was moved: {servo} stands at {exact}, beyond its limits {between}",
             "move it there by hand. If others do too, this is another arm (is it the leader's port?), or"
             " it was homed since: projservo limits",
         ),
@@ -205,6 +205,53 @@ ROBOTS: dict[str, Row] = (
             "leave that place out, or run projservo limits --shift {of[0]}, which stores an offset in "
             "its servo",
         ),
+        farthest_off=("markers {counts}, {joints} {size} off",),
+        no_markers=(
+            "{no} camera sees one of the {total} markers{looked}",
+            "look whether they stand before {towards}, at light and focus, and whether the dictionary of "
+            "the tags is right{here}",
+        ),
+        narrow_tags=(
+            "tags are {part} wide in the {view} image{looked}, {amount} a cell ({limit} at least)",
+            "take larger tags, nearer cameras, or more pixels",
+        ),
+        unseeing_camera=(
+            "the {view} camera sees none of the {total} markers{looked}, the {other_view} one {count}",
+            "turn it towards them, and look at its light and focus",
+        ),
+        faceless=("{sharing} marker {numbers} of the face at none of {count} poses", "turn it to them"),
+        hidden_face=(
+            "the {view} camera does not see marker {numbers} of the face",
+            "turn the face towards {towards}",
+        ),
+        hidden_object=(
+            "of the object {name}, {sharing} marker {some} ({total} at least)",
+            "turn it towards {towards}, or leave it out of objects; --force teaches again",
+        ),
+        moved_in_images=("{joints} moved by {amount} while images were taken ({limit} at most)", _HANDS),
+        moved_since_held=(
+            "{joints} moved by {amount} since the arm was held again ({limit} at most)",
+            _HANDS,
+        ),
+        limit_passed=("{joints} would be at {exact}, beyond its limits {between}",),
+        not_read=("nothing was read before",),
+        not_finite_command=("a set-point, its speed or its time is not finite",),
+        reading_far=(
+            "{joints} reads {exact}, its set-point is {exact_limit}",
+            "check its unit and its encoder",
+        ),
+        set_point_ahead=(
+            "the set-point of {joints}, {exact}, leads the reading too far: allowed is {between}",
+        ),
+        set_point_far=("the set-point of {joints}, {exact}, is too far from its last: allowed is {between}",),
+        set_point_passed=("the set-point of {joints}, {exact}, is beyond its limits: allowed is {between}",),
+        speed_passed=("the speed of {joints}, {exact}/s, is beyond its limit of {exact_limit}/s",),
+        reading_leapt=(
+            "{joints} read {part} and {amount} within {of_rest_s}",
+            "check its encoder and unit, or what moved it",
+        ),
+        dropped=("the {name} holds nothing, and should hold the object {of_name}", "look where that lies"),
+        stays=("the {name} stays at {amount}",),
     )
     | _about(
         "{images}",
@@ -239,11 +286,11 @@ ROBOTS: dict[str, Row] = (
         "{joints}",
         joint_without_limits=("has no limits", "set robot.limits.joints, or run projservo limits"),
         joint_beyond_limits=(
-            "reads {amount}, beyond its limits {part} to {of_part}",
+            "reads {exact}, beyond its limits {between}",
             "move it back by hand; a reading far off has another unit or zero than the limits",
         ),
         joint_at_limit=(
-            "reads {amount}, at its limits {part} to {of_part}",
+            "reads {exact}, at its limits {between}",
             "move it away from there by hand",
         ),
         joint_without_room=("it has no room for {amount}", "move it away from its limit by hand"),
@@ -290,34 +337,5 @@ ROBOTS: dict[str, Row] = (
             "put the {view} camera back, or fit it again from {of_poses} poses, after which it errs by "
             "{amount} ({limit} before it moved)",
         ),
-        farthest_off=("markers {counts}, {joints} {size} off",),
-        no_markers=(
-            "{no} camera sees one of the {total} markers{looked}",
-            "look whether they stand before {towards}, at light and focus, and whether the dictionary of "
-            "the tags is right{here}",
-        ),
-        narrow_tags=(
-            "tags are {part} wide in the {view} image{looked}, {amount} a cell ({limit} at least)",
-            "take larger tags, nearer cameras, or more pixels",
-        ),
-        unseeing_camera=(
-            "the {view} camera sees none of the {total} markers{looked}, the {other_view} one {count}",
-            "turn it towards them, and look at its light and focus",
-        ),
-        faceless=("{sharing} marker {numbers} of the face at none of {count} poses", "turn it to them"),
-        hidden_face=(
-            "the {view} camera does not see marker {numbers} of the face",
-            "turn the face towards {towards}",
-        ),
-        hidden_object=(
-            "of the object {name}, {sharing} marker {some} ({total} at least)",
-            "turn it towards {towards}, or leave it out of objects; --force teaches again",
-        ),
-        moved_in_images=("{joints} moved by {amount} while images were taken ({limit} at most)", _HANDS),
-        moved_since_held=(
-            "{joints} moved by {amount} since the arm was held again ({limit} at most)",
-            _HANDS,
-        ),
-        limit_passed=("{joints} would be at {amount}, beyond its limits {part} to {of_part}",),
     )
 )

@@ -10,6 +10,8 @@ from projservo_cli.records import CORNERS, LIMITS_MISSING, TOOL
 from projservo_cli.words.reasons import because
 from projservo_cli.words.table import Setup, row_of
 
+# Digits of what is compared with a limit, which may be close.
+_DIGITS = 6
 # Maximum number of names in a list of examples, and of runs of poses.
 _EXAMPLES, _MAX_RUNS = 3, 4
 _UNITS = {
@@ -334,6 +336,12 @@ VALUES: dict[str, Callable[[Told], object]] = {
     "of_rest": lambda told: f"{told.rest.limit:.0f}",
     "part": lambda told: quantity(told.rest.amount, told.rest.unit),
     "of_part": lambda told: quantity(told.rest.limit, told.rest.unit),
+    "of_rest_s": lambda told: quantity(told.rest.limit, "s"),
+    "exact": lambda told: quantity(told.one.amount, told.one.unit, _DIGITS),
+    "exact_limit": lambda told: quantity(told.one.limit, told.one.unit, _DIGITS),
+    "between": lambda told: " to ".join(
+        quantity(end, told.rest.unit, _DIGITS) for end in (told.rest.amount, told.rest.limit)
+    ),
     # Of plans.
     "nearest": lambda told: "all constraints hold; nearest is " if told.one.severity == NOTE else "",
     "fails": lambda told: "" if told.one.severity == NOTE else " fails first",

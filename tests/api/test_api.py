@@ -331,7 +331,7 @@ REFUSED = [
     (lambda c, k, p: ps.load("configs/ur5.yaml"), "a configuration, which Config.load reads"),
     (lambda c, k, p: ps.simulate(c, np.zeros((2, 5))), r"q of shape \(2, 5\): expected \(K, 6\), rad or m"),
     (lambda c, k, p: ps.simulate(c, np.full((1, 6), np.nan)), "q: holds a number that is not finite"),
-    (lambda c, k, p: ps.simulate(c, np.full((1, 6), 7.0)), "q: pose 0: joint 1 would be at 401°, beyond"),
+    (lambda c, k, p: ps.simulate(c, np.full((1, 6), 7.0)), "q: pose 0: joint 1 would be at 401.07°, beyond"),
     (lambda c, k, p: ps.simulate(c, np.full((1, 6), 90.0)), "joint 1 at 90 is more than two turns in rad"),
     (lambda c, k, p: ps.simulate(c, "here"), r"q: no array of numbers; expected shape \(K, 6\), rad or m"),
     (lambda c, k, p: ps.simulate("ur5"), "simulate: config of type str: read one with Config.load"),

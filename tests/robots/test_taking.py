@@ -45,9 +45,9 @@ def test_what_was_taken_belongs_to_the_tool_until_the_next_action_of_that_name()
     session.act("light", 1.0)
     assert session.held == {"gripper": "part"}
     session.holds = False
-    assert session.lost == "the gripper holds nothing, and should hold the object part: look where that lies"
+    assert (session.lost.code, session.lost.subject.name) == ("dropped", "gripper")
     session.act("gripper", 1.0)
-    assert (session.held, session.lost) == ({}, "")
+    assert (session.held, session.lost) == ({}, None)
 
 
 @pytest.mark.parametrize(
@@ -71,4 +71,4 @@ def test_a_robot_that_cannot_tell_is_believed():
     session = Gripping(holds=None)
     session.arrive()
     session.act("gripper", 0.0)
-    assert (session.held, session.lost) == ({"gripper": "part"}, "")
+    assert (session.held, session.lost) == ({"gripper": "part"}, None)

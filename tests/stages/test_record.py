@@ -112,7 +112,7 @@ def test_further_motions_follow_the_trials_and_continue_their_table(projservo):
     Path("far.csv").write_text("pose,q1,q2,q3,q4,q5,q6\n8,0,0,0,0,0,7\n")
     refused = projservo("record", "-c", UR5, *FEW, "--motions", "far.csv", "-o", "u.csv")
     assert refused.code == 2
-    assert "pose 8: joint 6 would be at 401°, beyond its limits" in refused.err
+    assert "pose 8: joint 6 would be at 401.07°, beyond its limits" in refused.err
     assert not Path("u.csv").exists()
 
 
