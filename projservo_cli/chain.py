@@ -31,7 +31,6 @@ from projservo_cli.stages.stage_inputs import CarryingObject, PlanInputs, ServoI
 from projservo_cli.store.run_file import SERVO, Run, save
 from projservo_cli.words import failed, line, lines
 from projservo_cli.words.reasons import arrived, meaning
-from projservo_cli.words.table import Setup
 
 if TYPE_CHECKING:
     from projservo_cli.robots.session import Session
@@ -217,11 +216,10 @@ class Chain:
                 )
             if (far := too_far(plan, carrier)) is None:
                 continue
-            why = line(far, Setup())
             if not self.confirm:
-                self._fail(motion, WorkFailed(why, findings=[far]))
+                self._fail(motion, failed([far]))
                 return False
-            self.listener.say(why)
+            self.listener.say(line(far))
         if self.confirm:
             if self.config.steps:
                 self.listener.say(f"servo: one after the other: {', '.join(self.config.steps)}")

@@ -57,8 +57,18 @@ class Finding:
         return dict.fromkeys(values) | known | {"subject": subject}
 
 
-def sparse(record: Any) -> dict[str, Any]:
-    """Return the fields of a finding or a subject for a file, those that are not NaN or as by default."""
+def told(text: str, severity: str = LIMITS) -> Finding:
+    """Return a finding on what somebody else says in words: another version, a robot class, an error."""
+    return Finding("told", severity, Subject(name=text))
+
+
+def sparse(record: Any) -> Any:
+    """Return the fields of a finding or a subject for a file, those that are not NaN or as by default.
+
+    Numbers of NumPy are plain ones there.
+    """
+    if isinstance(record, np.generic):
+        return record.item()
     own = {one.name: (getattr(record, one.name), one.default) for one in fields(record)}
     return {name: value for name, (value, default) in own.items() if value == value and value != default}
 

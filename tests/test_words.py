@@ -1,12 +1,14 @@
 """Words for findings: each code, before any cameras, for joints that turn and that slide."""
 
 import itertools
+import json
 import re
 
+import numpy as np
 import pytest
 
 from projservo_cli import words
-from projservo_cli.findings import DEVIATIONS, LIMITS, REFUSES, Finding, Subject
+from projservo_cli.findings import DEVIATIONS, LIMITS, REFUSES, Finding, Subject, sparse
 from projservo_cli.records import TOOL, WORLD
 from projservo_cli.words import table
 
@@ -93,3 +95,9 @@ def test_cameras_without_a_marker_are_named_by_their_number():
 
 def test_no_two_tables_have_words_for_one_code():
     assert sum(map(len, table.TABLES)) == len(table.ROWS)
+
+
+def test_numbers_of_numpy_in_findings_are_stored_as_plain_ones():
+    one = Finding("misfit", subject=Subject(joints=(np.int64(2),)), amount=np.int64(3), limit=np.float32(0.5))
+    stored = json.loads(json.dumps(one, default=sparse))
+    assert stored == {"code": "misfit", "subject": {"joints": [2]}, "amount": 3, "limit": 0.5}

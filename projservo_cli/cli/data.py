@@ -100,8 +100,8 @@ def _teach(
                 check = stage.checked(plan_inputs(settings), calibration, taught)
         except WorkFailed as error:
             reason = " ".join(str(error).split()).removeprefix("teach: ")
-            found = [one.plain() for one in error.findings]
-            value = {"file": output.resolve(), "failed": "teach", "reason": reason, "findings": found}
+            value = {"file": output.resolve(), "failed": "teach", "reason": reason}
+            value["findings"] = list(error.findings)
             console.report(value, ["teach: failed; no file was written"])
             raise WorkFailed(f"teach: {reason}", findings=error.findings) from error
         write_whole(output, _TAUGHT + plain_yaml(taught.as_goal()))
@@ -139,7 +139,6 @@ def _print_taught(console: Console, path: Path, taught: Any, check: Any, setting
     }
     keys = "off_px", "far", "reached", "reason", "findings"
     value |= dict.fromkeys(keys) if check is None else check._asdict()
-    value["findings"] = None if check is None else [one.plain() for one in check.findings]
     certain = f", to {np.nanmax(taught.sigma):.3g} px" if np.isfinite(taught.sigma).any() else ""
     known, shared = len(taught.marker), taught.shared
     where = {1: "", 2: " in both views,"}.get(len(taught.view), " in two views,")
@@ -358,12 +357,12 @@ def _validate(
         raise click.UsageError("--readings are the joints beside --data, which is not given")
     if data is not None and metric is not None:
         raise click.UsageError("--data and --metric: validate takes one of them; leave the other out")
-    from projservo_cli.calibration.checks.validation import residual_statistics
+    from projservo_cli.calibration.checks.validation import median_limit, residual_statistics
     from projservo_cli.config import load_config
     from projservo_cli.findings import REFUSES
     from projservo_cli.store.observation_tables import read_detections, read_table
     from projservo_cli.store.run_file import load
-    from projservo_cli.words import failed, order_advice, setup_of
+    from projservo_cli.words import failed, order_advice, sentence, setup_of
 
     found = load(target)
     calibration = found.calibration
@@ -399,11 +398,7 @@ def _validate(
     if value["limit_px"] is None:
         console.report(value, words)
         return
-    allowed = (
-        "{limit_px:.3g} px allowed: 3 times the stated error of {stated_px:.3g} px and the noise of these "
-        "images, {noise_px:.3g} px, together".format_map(value)
-    )
-    words.append(wrapped(f"median {allowed}", "  "))
+    words.append(wrapped(sentence(median_limit(value)), "  "))
     refusing = [one for one in value["findings"] if one.severity == REFUSES]
     if refusing:
         of_view = "{view} camera: median {median_px:.3g} px of {count} pairs, {limit_px:.3g} px allowed"

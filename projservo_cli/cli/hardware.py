@@ -163,15 +163,16 @@ def doctor(
             progress=console.progress,
         )
         pictures = {} if checked.seen is None else _pictures(settings, checked.seen)
-        write_whole(output, preflight_page(settings.name, checked.rows, pictures))
+        rows = checked.rows
+        write_whole(output, preflight_page(settings.name, rows, pictures))
     refit = _refit(checked, stored, config, output)
     value = {
         "page": output.resolve(),
         "works": checked.works,
-        "findings": checked.rows,
+        "findings": rows,
         "refit": refit,
     }
-    console.report(value, [*_table(checked), f"page: {output}", *(refit["commands"] if refit else ())])
+    console.report(value, [*_table(rows), f"page: {output}", *(refit["commands"] if refit else ())])
     if stored is not None and checked.refuted is not None:
         _note_refuted(stored.path, checked.refuted)
     return 0 if checked.works else FAILED
@@ -212,16 +213,16 @@ _QUESTION = (
 )
 
 
-def _table(checked: "Checked") -> Iterator[str]:
-    width = max(len(row["where"]) for row in checked.rows)
-    for row in checked.rows:
+def _table(rows: Sequence[Mapping[str, str]]) -> Iterator[str]:
+    width = max(len(row["where"]) for row in rows)
+    for row in rows:
         head = f"{row['level']:8}{row['where']:{width + 2}}"
         yield head + wrapped(row["text"], " " * len(head))[len(head) :]
         if row["remedy"]:
             yield wrapped(row["remedy"], " " * len(head))
-    faults = sum(row["level"] == "fault" for row in checked.rows)
+    faults = sum(row["level"] == "fault" for row in rows)
     mend = f"doctor: {faults} fault{'s' * (faults > 1)} to mend before recording"
-    yield "doctor: ready to record" if checked.works else mend
+    yield mend if faults else "doctor: ready to record"
 
 
 def _goal_pixels(settings: "Config", view: Sequence[str]) -> "list[FloatArray]":

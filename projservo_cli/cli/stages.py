@@ -1,7 +1,7 @@
 """Commands of the stages and of their chain: dry run, work, summary."""
 
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,7 +16,7 @@ from projservo_cli.cli.program import FAILED, main
 if TYPE_CHECKING:
     from projservo_cli.chain import Chain
     from projservo_cli.config import Config
-    from projservo_cli.findings import Finding
+    from projservo_cli.records import WorkFailed
     from projservo_cli.store.run_file import Run
 
 _NAMING = {"plant": {"plant", "plant.use"}, "law": {"control", "control.laws"}}  # keys of --set
@@ -146,18 +146,19 @@ def _record(stages: Sequence[str], /, console: Console, **options: Any) -> int:
         with writing(path):
             recording = new_recording(given, path, motions=poses, force=options["force"])
             why = recording_made(console, config, recording, confirm=options["confirm"])
-    value = _recording_object(recording, *(("", ()) if why is None else (str(why), why.findings)))
+    value = _recording_object(recording, why)
     console.report(value, [*words_of("record", value), *([f"table: {path}"] if path.exists() else [])])
     if why:
         click.echo(visible(f"projservo: record: {why}"), err=True)
     return FAILED if why else 0
 
 
-def _recording_object(recording: Any, reason: str, found: "Iterable[Finding]") -> dict[str, Any]:
+def _recording_object(recording: Any, why: "WorkFailed | None") -> dict[str, Any]:
     """The JSON object of a recording, and why it stopped short where it did."""
     explained: dict[str, Any] = recording.summary
-    why = {"reason": reason, "findings": [one.plain() for one in found], "failed": "record"}
-    return explained | (why if reason else {})
+    if why is None:
+        return explained
+    return explained | {"reason": str(why), "findings": list(why.findings), "failed": "record"}
 
 
 def _motions(config: Any, options: Mapping[str, Any]) -> Any:
@@ -514,13 +515,14 @@ def _work(console: Console, chain: "Chain", options: Mapping[str, Any]) -> int:
     if (wanted := _optional_files(options)) and not chain.lacks("report"):
         beside["report"] |= chain.optional_files(wanted)
     beside["report"]["replayed"] = chain.replayed()
+    from projservo_cli.records import WorkFailed
     from projservo_cli.report.report_data import failed_object, stage_object
 
     values, joints = {}, chain.config.joint_names
     for name in chain.names:
         if name == "record":
-            why = (chain.reason, chain.evidence) if chain.lacks(name) else ("", ())
-            values[name] = {"run": chain.run.path.resolve()} | _recording_object(chain.recording, *why)
+            short = WorkFailed(chain.reason, findings=chain.evidence) if chain.lacks(name) else None
+            values[name] = {"run": chain.run.path.resolve()} | _recording_object(chain.recording, short)
         elif chain.lacks(name):
             why = chain.reason, chain.evidence
             values[name] = failed_object(name, chain.run, why, chain.failed, chain.laws_done)

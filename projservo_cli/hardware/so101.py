@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from projservo_cli.findings import LIMITS, REFUSES, Finding, Subject
+from projservo_cli.findings import LIMITS, REFUSES, Finding, Subject, told
 from projservo_cli.hardware.feetech import FeetechBus, PortLost, ServoSilent
 from projservo_cli.records import FloatArray, InputError, JointLimits, WorkFailed
 from projservo_cli.words import failed, line
@@ -198,14 +198,14 @@ class Servos:
 
     def failure(self, error: WorkFailed) -> Finding:
         """Tell which joints may fall where the bus fails; nothing more is written to them."""
-        told = Finding("told", REFUSES, Subject(name=str(error)))
+        lost = told(str(error), REFUSES)
         if not isinstance(error, ServoSilent):
-            return replace(told, code="lost_port")
+            return replace(lost, code="lost_port")
         silent = tuple(map(self.finding, error.silent))
         everything = {*error.silent} >= {*self.alive}
         self.lost |= {*error.silent}
         if error.garbled:
-            return told
+            return lost
         return Finding("silent_arm" if everything else "silent_servos", REFUSES, others=silent)
 
     def finding(self, number: int) -> Finding:

@@ -23,7 +23,7 @@ from numba.experimental import structref
 
 from projservo_cli.control import command, make_law
 from projservo_cli.control.law import ERRORS, OK, Gains, Law, State, new_state
-from projservo_cli.findings import REFUSES, Finding, Subject
+from projservo_cli.findings import REFUSES, Finding, told
 from projservo_cli.geometry.jit import COMPILED, njit
 from projservo_cli.geometry.mechanisms import make_span
 from projservo_cli.loop.verdicts import (
@@ -97,7 +97,7 @@ class Monitored(Protocol):
     """Interface of a plant for the fault monitor."""
 
     plant: Plant  # the truth, or its calibrated model: image size, joint limits
-    # why the run cannot go on, the images no longer agree with the calibration or something failed; empty
+    # why the run cannot go on, the images no longer agree with the calibration or something failed; None
     # where it can
     disturbance: Finding | None
 
@@ -281,8 +281,7 @@ def run_in_python(
             except WorkFailed as error:
                 if k == 0:
                     raise
-                verdict = FAILED
-                plant.disturbance = Finding("told", REFUSES, Subject(name=str(error)))
+                verdict, plant.disturbance = FAILED, told(str(error), REFUSES)
             k += verdict < 0
     finally:
         plant.stop()

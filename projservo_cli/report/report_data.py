@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from projservo_cli.calibration.joint_model import describe_curve
-from projservo_cli.findings import REFUSES, Finding, Subject, named, of_readings
+from projservo_cli.findings import REFUSES, Finding, named, of_readings, told
 from projservo_cli.geometry.kinematics import project
 from projservo_cli.laws import IMAGE_TRACK, POINT_LAWS, REGULATE, TRACK, law_and_mode, title_of
 from projservo_cli.metric.frame import Metric
@@ -362,7 +362,7 @@ def failed_object(
 ) -> dict[str, Any]:
     """Return the JSON object of a stage that failed, or lacks its inputs; why : its reason and findings."""
     failure: dict[str, Any] = {"run": run.path.resolve(), "reason": why[0], "failed": at}
-    failure["findings"] = list(why[1]) or [Finding("told", REFUSES, Subject(name=why[0]))]
+    failure["findings"] = list(why[1]) or [told(why[0], REFUSES)]
     if stage == "calibrate":
         lists: dict[str, Any] = {name: [] for name in ("advice", "joints", *_LISTS)}
         numbers = dict.fromkeys(_NUMBERS) | dict.fromkeys(_COUNTS, 0)

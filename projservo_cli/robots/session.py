@@ -10,8 +10,7 @@ from projservo_cli.records import FloatArray, InputError, WorkFailed
 from projservo_cli.robots.contract import PluginRobot, at_rest_after
 from projservo_cli.robots.object_watch import LOOKS, ObjectWatch
 from projservo_cli.robots.pacing import Steered
-from projservo_cli.words import failed, line
-from projservo_cli.words.table import Setup
+from projservo_cli.words import failed
 
 
 class Session:
@@ -81,8 +80,7 @@ class Session:
         for _ in range(LOOKS):
             watch.observe(self.steered.hold())
             if watch.moved:
-                why = line(watch.moved, Setup())
-                raise WorkFailed(f"nothing was taken: {why}", findings=[watch.moved])
+                raise failed([watch.moved], begin="nothing was taken: ")
         if not watch.seen:
             raise WorkFailed(
                 f"nothing was taken: no image shows the object {watch.name} where it is to be: look where it "

@@ -12,7 +12,7 @@ import numpy as np
 from projservo_cli import words
 from projservo_cli.calibration.refit import view_errors
 from projservo_cli.detection import DICTIONARY, finder_of
-from projservo_cli.findings import LIMITS, NOTE, REFUSES, Finding, Subject, usable
+from projservo_cli.findings import LIMITS, NOTE, REFUSES, Finding, told, usable
 from projservo_cli.hardware.camera_robot import CameraRobot, View
 from projservo_cli.hardware.checks_at_rest import RobotAtRest, findings_at_rest
 from projservo_cli.hardware.checks_in_motion import Strokes, findings_of, reach_of, strokes
@@ -104,8 +104,7 @@ def check(
     except (InputError, WorkFailed) as error:
         if isinstance(error, InputError) and at_rest is None:
             raise
-        told = (Finding("told", REFUSES, Subject(name=str(error))),)
-        findings += (error.findings if isinstance(error, WorkFailed) else ()) or told
+        findings += (error.findings if isinstance(error, WorkFailed) else ()) or (told(str(error), REFUSES),)
     setup = Setup(inputs.mount, robot.view, len(joints.types))
     return Checked(tuple(findings), at_rest, tuple(moved), mend, setup)
 

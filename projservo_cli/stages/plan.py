@@ -9,7 +9,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from projservo_cli.control.law import State
-from projservo_cli.findings import LIMITS, NOTE, Finding, Subject, usable
+from projservo_cli.findings import LIMITS, NOTE, Finding, Subject, told, usable
 from projservo_cli.geometry.algebra import as_array, vec
 from projservo_cli.geometry.displacements import composed_angle
 from projservo_cli.geometry.kernels import COORDINATES, RANK_TOLERANCE
@@ -62,7 +62,7 @@ from projservo_cli.task.visibility import (
     visibility_angles,
     visibility_translation,
 )
-from projservo_cli.words import line, lines, setup_of, text
+from projservo_cli.words import failed, line, lines, setup_of, text
 from projservo_cli.words.table import Setup
 
 
@@ -236,7 +236,7 @@ def _require_taught_since(scenario: Scenario, calibration: Calibration) -> None:
     if images.joints is not None:
         q = images.joints.values(calibration.joint_types)
         if fault := detected_fault(calibration, q, numbers, seen, size):
-            raise _changed(fault, calibration, "teach it again")
+            raise failed([fault], setup_of(calibration), _CHANGED, "; teach it again")
         _require_rigid(rigid_fit(calibration, q, *whole), calibration.view, "teach it again")
         return
     stated = images.sigma_px(scenario.numbers[: scenario.m], scenario.inputs.face)
@@ -264,7 +264,7 @@ def _require_taught_since(scenario: Scenario, calibration: Calibration) -> None:
             f"px off in the {calibration.view[v]} one, {near_px:.3g} px are allowed; {check}"
         )
     if enough and (fault := detected_fault(calibration, q, numbers, seen, size, sigma)):
-        raise _changed(fault, calibration, advice)
+        raise failed([fault], setup_of(calibration), _CHANGED, f"; {advice}")
     if not enough and not fit.reached:
         units = scenario.joints.units
         there = ", ".join(in_unit(x, unit, 4) for x, unit in zip(q.tolist(), units, strict=True))
@@ -275,11 +275,7 @@ def _require_taught_since(scenario: Scenario, calibration: Calibration) -> None:
         )
 
 
-def _changed(fault: Finding, calibration: Calibration, advice: str) -> WorkFailed:
-    """Return the failure of a goal that was taught after a fault."""
-    why = line(fault, setup_of(calibration))
-    words = f"the goal was taught after a change since the calibration: {why}; {advice}"
-    return WorkFailed(words, findings=[fault])
+_CHANGED = "the goal was taught after a change since the calibration: "
 
 
 def _require_rigid(fit: RigidFit, view: Sequence[str], advice: str) -> None:
@@ -321,7 +317,7 @@ def plan_task(
         except WorkFailed as error:
             if last:
                 raise
-            before.append((profile, Finding("told", subject=Subject(name=str(error)))))
+            before.append((profile, told(str(error), NOTE)))
             continue
         if fails is None or last:
             if shut is not None and fails is not None and profile != "joint_space":
@@ -352,7 +348,7 @@ def _found(
     if profile == "joint_space":
         shut = why_closed(reaching.model, reaching.demands, search)
         if search is None or shut is not None:
-            raise InputError(f"the profile joint_space: {'' if shut is None else line(shut, Setup())}")
+            raise InputError(f"the profile joint_space: {'' if shut is None else line(shut)}")
         return joint_path(reaching, task, trajectory, search)
     if profile == "constrained":
         found = coupled(reaching, trajectory)

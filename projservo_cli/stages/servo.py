@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 
 from projservo_cli import plugins
 from projservo_cli.control.law import ERRORS, LOST, MAX_PARTS, OK, TAU_AFFINE, THETA_S, Gains
-from projservo_cli.findings import LIMITS, NOTE, REFUSES, Finding, Subject
+from projservo_cli.findings import LIMITS, NOTE, REFUSES, Finding, Subject, told
 from projservo_cli.geometry.algebra import as_array, mat
 from projservo_cli.geometry.kernels import COORDINATES
 from projservo_cli.geometry.kinematics import forward
@@ -75,7 +75,7 @@ from projservo_cli.task.incidences import (
     whole_pose,
 )
 from projservo_cli.task.target import TaskImages, followed
-from projservo_cli.words import line, lines, order_advice, text
+from projservo_cli.words import failed, order_advice, text
 from projservo_cli.words.reasons import VERDICTS, arrived
 from projservo_cli.words.table import Setup
 from projservo_cli.words.values import all_of
@@ -223,7 +223,7 @@ class LawRun:
 
     def _stopped(self, what: str, fault: Finding, *, refutes: bool) -> WorkFailed:
         """Return the failure of a robot that a fault stopped before the run."""
-        return WorkFailed(f"{what} {line(fault, self.setup)}", refutes=refutes, findings=[fault])
+        return failed([fault], self.setup, f"{what} ", refutes=refutes)
 
     def _require_images(self, driven: DrivenRobot, what: str, seeing: int) -> Finding | None:
         """Refuse to move a robot of which fewer than so many cameras show markers, unless that was asked for.
@@ -232,11 +232,12 @@ class LawRun:
         """
         unseen = driven.unseen(seeing, held=seeing > 1)
         if unseen and not self.blind:
-            remarks = "; ".join([line(unseen, self.setup), *lines(driven.robot.remarks())])
-            raise WorkFailed(
-                f"{what} {remarks}: uncover {all_of(driven.robot.view)} and look at the light, or move the "
-                "arm by hand to where they see the tags; --blind (blind=True) drives it without images"
+            found = [unseen, *driven.robot.remarks()]
+            mend = (
+                f": uncover {all_of(driven.robot.view)} and look at the light, or move the arm by hand to "
+                "where they see the tags; --blind (blind=True) drives it without images"
             )
+            raise failed(found, self.setup, f"{what} ", mend)
         return unseen
 
     def in_python(
@@ -619,7 +620,7 @@ def _reason(run: LawRun, joint: int, remaining: tuple[float | None, float | None
         yield replace(own, code="remaining", others=tuple(parts))
     yield from _blind_view(log.s[: steps + 1], run.scenario.view, limits.stall_periods)
     if run.driven is not None and (obstruction := obstruction_of(run.driven.robot.robot)):
-        yield Finding("told", LIMITS, Subject(name=obstruction))
+        yield told(obstruction)
 
 
 def _grown(run: LawRun, own: Finding, at_step: Finding) -> Finding:

@@ -30,7 +30,7 @@ import numpy.typing as npt
 from pydantic import TypeAdapter, ValidationError
 
 from projservo_cli.files import replacing
-from projservo_cli.findings import LIMITS, NOTE, REFUSES, Finding, Subject, of_columns, sparse
+from projservo_cli.findings import LIMITS, NOTE, REFUSES, Finding, of_columns, sparse, told
 from projservo_cli.records import (
     SIZES,
     VIEWS,
@@ -447,7 +447,7 @@ def load_record(group: h5py.Group, kind: Any, sizes: dict[str, int]) -> Any:
 def _told(c: Calibration) -> tuple[Finding, ...]:
     """Findings of a calibration of an earlier version, which stored sentences and columns alone."""
     units, setup = ["m" if letter == "P" else "rad" for letter in c.joint_types], setup_of(c)
-    found = [Finding("told", NOTE if c.usable else REFUSES, Subject(name=c.reason))]
+    found = [told(c.reason, NOTE if c.usable else REFUSES)]
     rows = () if c.model_error_numbers is None else c.model_error_numbers.tolist()
     found += [of_columns(*one, units) for one in zip(c.model_error, rows, strict=True)]
     found += c.open_order
@@ -457,7 +457,7 @@ def _told(c: Calibration) -> tuple[Finding, ...]:
     known = {text for one in found for text in (line(one, setup), sentence(one, setup))}
     for text in c.advice:
         if text not in known:
-            found.append(Finding("told", NOTE if text in c.notes else LIMITS, Subject(name=text)))
+            found.append(told(text, NOTE if text in c.notes else LIMITS))
     return tuple(found)
 
 

@@ -53,10 +53,17 @@ def row(one: Finding, setup: Setup) -> dict[str, str]:
     return {"level": _LEVELS[one.severity], "where": where, "text": sentence(one, setup), "remedy": remedy}
 
 
-def failed(findings: Iterable[Finding], setup: Setup = _SETUP, begin: str = "", end: str = "") -> WorkFailed:
+def failed(
+    findings: Iterable[Finding],
+    setup: Setup = _SETUP,
+    begin: str = "",
+    end: str = "",
+    *,
+    refutes: bool = False,
+) -> WorkFailed:
     """Return the error that findings are, told between a beginning such as ``teach: `` and an end."""
     found = tuple(findings)
-    return WorkFailed(f"{begin}{text(found, setup)}{end}", findings=found)
+    return WorkFailed(f"{begin}{text(found, setup)}{end}", refutes=refutes, findings=found)
 
 
 def text(findings: Iterable[Finding], setup: Setup = _SETUP) -> str:

@@ -182,7 +182,7 @@ CALIBRATION = {
         limit="readings of other poses",
     ),
     "other_mount": Row(
-        "by the images the cameras are {there}", "give --mount {mount} (data.mount)", limit="the mount"
+        "by the images the cameras are {there}", "give --mount {name} (data.mount)", limit="the mount"
     ),
     "joint_type": Row(
         "by the images {joints} is {fits}, not {given}",

@@ -46,7 +46,7 @@ class Told:
         return VALUES[name](self)
 
     def text(self, part: str) -> str:
-        """Return the limit, sentence or remedy."""
+        """Return a text of the row, by its name."""
         text: str = getattr(row_of(self.one, self.setup), part)
         return text.format_map(self)
 
@@ -273,21 +273,10 @@ def _model_errors(told: Told) -> str:
     return f"{' and '.join(words)} {last}" if undecided else " and ".join((*words, last))
 
 
-def _medians(told: Told) -> str:
-    """Say which medians pass their limits: of each view, else of all together."""
-    if told.rest.code == "contradicted_view":
-        return "; ".join(told.others("sentence"))
-    return (
-        f"median {told['amount']}, {told['limit']} allowed: 3 times the stated error of {told['part']} and "
-        f"the noise of these images, {told['of_part']}, together"
-    )
-
-
 VALUES: dict[str, Callable[[Told], object]] = {
     # Of the subject.
     "of": lambda told: told.subject.joints,
     "name": lambda told: told.subject.name,
-    "mount": lambda told: told.subject.name,
     "joints": _joints,
     "it": lambda told: "it" if told.single else "each",
     "moves": lambda told: "moves" if told.single else "move",
@@ -350,7 +339,7 @@ VALUES: dict[str, Callable[[Told], object]] = {
         + ", ".join(f"{one.subject.name} {one.amount:.2f}" for one in told.one.others if one.code == "share")
     ),
     "enough_see": _enough_see,
-    "enough": lambda told: "both cameras" if len(told.setup.view) == 2 else "enough cameras",
+    "enough": lambda told: _by_views(told, "enough cameras", "both cameras", "enough cameras"),
     "both": lambda told: "both" if len(told.setup.view) == 2 else "all",
     "since": lambda told: ", ".join(
         f"{one.subject.views[0]} from path parameter {one.amount:.2f}" for one in told.one.others
@@ -434,7 +423,6 @@ VALUES: dict[str, Callable[[Told], object]] = {
     "views_off": lambda told: "".join(f"; {said}" for said in told.others("sentence")),
     # Of two views that number differently, and of a model.
     "part_of_cameras": lambda told: {1: "one camera alone"}.get(len(told.subject.views), "some cameras"),
-    "medians": _medians,
     "of_markers": lambda told: told.subject.markers,
     "pairs": lambda told: "; ".join(told.others("sentence")[:_EXAMPLES]),
     "begins": lambda told: (

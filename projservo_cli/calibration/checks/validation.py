@@ -353,9 +353,17 @@ def residual_statistics(calibration: Calibration, observation: Observation) -> d
     return found | {"findings": [*told, *contradictions(found)]}
 
 
+def median_limit(found: Mapping[str, Any]) -> Finding:
+    """Return the median of statistics of residuals, with its limit and what that is of."""
+    parts = (Finding("errors", amount=found["stated_px"], limit=found["noise_px"], unit="px"),)
+    return Finding(
+        "median_limit", NOTE, amount=found["median_px"], limit=found["limit_px"], unit="px", others=parts
+    )
+
+
 def contradictions(found: Mapping[str, Any]) -> Iterator[Finding]:
     """Tell by the statistics of residuals whether a median passes its limit: of some views, or of all."""
-    stated, noise, limit, median = (found[f"{name}_px"] for name in ("stated", "noise", "limit", "median"))
+    limit, median = found["limit_px"], found["median_px"]
     if limit is None:
         return
     beyond = tuple(
@@ -368,7 +376,7 @@ def contradictions(found: Mapping[str, Any]) -> Iterator[Finding]:
         views = tuple(view for one in beyond for view in one.subject.views)
         yield Finding("contradicted_in_part", REFUSES, Subject(views=views), others=beyond)
     elif beyond or median > limit:
-        parts = (Finding("noise", amount=stated, limit=noise, unit="px"),) if median > limit else beyond
+        parts = (median_limit(found),) if median > limit else beyond
         yield Finding("contradicted", REFUSES, amount=median, limit=limit, unit="px", others=parts)
 
 
