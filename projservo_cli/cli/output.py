@@ -322,8 +322,9 @@ def _of_plan(value: dict[str, Any], detailed: bool) -> Iterator[str]:
     rejected = [one.subject.name for one in value["findings"] if one.code == "rejected_profile"]
     if rejected and not detailed:
         yield wrapped(f"not {', '.join(rejected)}; why: -v", "  ")
-    for text in value["rejected_profiles"] if detailed else ():
-        yield wrapped(f"not {text}", "  ")
+    else:  # a plan of an earlier version has their texts alone
+        for text in value["rejected_profiles"]:
+            yield wrapped(f"not {text}", "  ")
     for text in value["relaxed_constraints"]:
         yield wrapped(text, "  ")
     if detailed:

@@ -45,6 +45,7 @@ from projservo_cli.records import (
     scalars_of,
 )
 from projservo_cli.words import line, sentence, setup_of
+from projservo_cli.words.reasons import arrived
 
 if typing.TYPE_CHECKING:
     import h5netcdf
@@ -439,13 +440,22 @@ def load_record(group: h5py.Group, kind: Any, sizes: dict[str, int]) -> Any:
     if "joint_types" in values and not re.fullmatch(f"[RP]{{{own['joint']}}}", values["joint_types"]):
         raise ValueError(f"joint_types are not {own['joint']} letters R and P")
     record = kind(**values)
-    if kind is Calibration and "findings" not in group.attrs:
+    if "findings" in values and "findings" not in group.attrs:
         return dataclasses.replace(record, findings=_told(record))
     return record
 
 
-def _told(c: Calibration) -> tuple[Finding, ...]:
-    """Findings of a calibration of an earlier version, which stored sentences and columns alone."""
+def _told(record: Any) -> tuple[Finding, ...]:
+    """Findings of a record of an earlier version, which stored sentences alone."""
+    if isinstance(record, Calibration):
+        return _told_of(record)
+    fails = isinstance(record, Plan) and not record.feasible
+    fails |= isinstance(record, Trace) and not arrived(record.verdict)
+    return (told(record.reason, REFUSES if fails else NOTE),)
+
+
+def _told_of(c: Calibration) -> tuple[Finding, ...]:
+    """Findings of a calibration of an earlier version, which had columns of deviations, too."""
     units, setup = ["m" if letter == "P" else "rad" for letter in c.joint_types], setup_of(c)
     found = [told(c.reason, NOTE if c.usable else REFUSES)]
     rows = () if c.model_error_numbers is None else c.model_error_numbers.tolist()

@@ -14,6 +14,7 @@ from projservo_cli.results import RunTrace
 from projservo_cli.store import run_file
 from projservo_cli.store.run_file import save_record
 from projservo_cli.words import with_findings
+from projservo_cli.words.reasons import arrived
 from tests.fake_records import fake
 from tests.store.deceit import EDITS, HEADS, edited, head, resealed
 from tests.store.sound import result, sound_file, sound_run
@@ -60,6 +61,16 @@ def test_a_calibration_of_an_earlier_version_has_its_sentences_as_findings(path)
     assert told == [before.reason, *before.advice]
     assert usable(calibration.findings) == before.usable
     assert with_findings(calibration, ()).reason == before.reason  # as a refit judges it once more
+
+
+@pytest.mark.parametrize("group", ["plan", "servo/direct_three"])
+def test_a_plan_and_a_run_of_an_earlier_version_have_their_reason_as_a_finding(path, group):
+    (before,) = run_file.load(path).results[group].records.values()
+    edited(path, head(group, "findings", None))
+    (after,) = run_file.load(path).results[group].records.values()
+    (one,) = after.findings
+    assert (one.code, one.subject.name) == ("told", before.reason)
+    assert usable(after.findings) == (before.feasible if group == "plan" else arrived(before.verdict))
 
 
 def test_everything_comes_back(tmp_path):
