@@ -398,7 +398,7 @@ def _validate(
     if value["limit_px"] is None:
         console.report(value, words)
         return
-    words.append(wrapped(sentence(median_limit(value)), "  "))
+    words.append(wrapped(f"median {sentence(median_limit(value))}", "  "))
     refusing = [one for one in value["findings"] if one.severity == REFUSES]
     if refusing:
         of_view = "{view} camera: median {median_px:.3g} px of {count} pairs, {limit_px:.3g} px allowed"

@@ -16,7 +16,7 @@ VALIDATIONS = {
     ),
     "no_spoiling_camera": Row("no camera spoils the others: without {view} they err {amount} times as much"),
     "contradicted": Row(
-        "the images contradict the calibration: {found}",
+        "the images contradict the calibration: {of_all}{found}",
         "check that these are the same robot, rig and markers, with joints in the same units; if so, "
         "calibrate again with such poses among the others",
     ),
@@ -25,8 +25,8 @@ VALIDATIONS = {
         "if it moved, fit it again: {name}",
     ),
     "median_limit": Row(
-        "median {amount}, {limit} allowed: 3 times the stated error of {part} and the noise of these images, "
-        "{of_part}, together"
+        "{limit} allowed: 3 times the stated error of {part} and the noise of these images, {of_part}, "
+        "together"
     ),
     "contradicted_view": Row("{view} camera: median {amount}, {limit} allowed"),
     "refit_outliers": Row(

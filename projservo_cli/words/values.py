@@ -423,6 +423,7 @@ VALUES: dict[str, Callable[[Told], object]] = {
     "views_off": lambda told: "".join(f"; {said}" for said in told.others("sentence")),
     # Of two views that number differently, and of a model.
     "part_of_cameras": lambda told: {1: "one camera alone"}.get(len(told.subject.views), "some cameras"),
+    "of_all": lambda told: f"median {told['amount']}, " if told.rest.code == "median_limit" else "",
     "of_markers": lambda told: told.subject.markers,
     "pairs": lambda told: "; ".join(told.others("sentence")[:_EXAMPLES]),
     "begins": lambda told: (

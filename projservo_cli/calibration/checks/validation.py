@@ -354,7 +354,7 @@ def residual_statistics(calibration: Calibration, observation: Observation) -> d
 
 
 def median_limit(found: Mapping[str, Any]) -> Finding:
-    """Return the median of statistics of residuals, with its limit and what that is of."""
+    """Return the limit of the median of residuals, and what that is of, by their statistics."""
     parts = (Finding("errors", amount=found["stated_px"], limit=found["noise_px"], unit="px"),)
     return Finding(
         "median_limit", NOTE, amount=found["median_px"], limit=found["limit_px"], unit="px", others=parts
