@@ -586,8 +586,7 @@ def recording_made(listener: Listener, config: Config, recording: Any, *, confir
     try:
         record_poses(recording_inputs(config), recording, progress=progress)
     except WorkFailed as error:
-        reason = " ".join(str(error).split()).removeprefix("record: ")
-        return WorkFailed(reason, findings=error.findings)
+        return WorkFailed(" ".join(error.reason.split()), findings=error.findings)
     except KeyboardInterrupt:
         listener.say(f"{recording.path}: {len(recording.done)} of {total} poses; run again to continue")
         raise

@@ -122,12 +122,16 @@ class InputError(ValueError):
 class WorkFailed(RuntimeError):  # noqa: N818 - a verdict, not a programming error
     """The data were read, but the work they ask for cannot be done (exit code 1).
 
+    stage : the work that failed, with which the text begins.
     refutes : whether images or readings of a robot contradict its calibration, and so the recording of it.
     findings : the evidence as data.
     """
 
-    def __init__(self, *args: object, refutes: bool = False, findings: Iterable[Finding] = ()) -> None:
-        super().__init__(*masked(args))
+    def __init__(
+        self, text: object = "", *, stage: str = "", refutes: bool = False, findings: Iterable[Finding] = ()
+    ) -> None:
+        (self.reason,) = masked((str(text),))
+        super().__init__(f"{stage}: {self.reason}" if stage else self.reason)
         self.refutes, self.findings = refutes, tuple(findings)
 
 

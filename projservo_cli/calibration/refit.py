@@ -286,12 +286,10 @@ def _fitted(images: _Images, v: int) -> _Camera:
     problem, found, c = images.problem, images.problem.detections, images.calibration
     seen = found.seen & (np.arange(len(found.seen)) == v)[:, None]
     poses = np.unique(found.pose_of[seen[v]]).size
-    open_ = (
-        f"{seen.sum()} detections of the {found.view[v]} camera at {poses} poses determine no camera "
-        f"({_LEAST} required, not in one plane): add poses in which several joints move, and markers"
-    )
+    of, at = Subject(views=(found.view[v],)), (Finding("poses", amount=float(poses), unit="1"),)
+    open_ = Finding("open_camera", REFUSES, of, float(seen.sum()), limit=_LEAST, unit="1", others=at)
     if seen.sum() < _LEAST:
-        raise WorkFailed(open_)
+        raise failed([open_])
     params = parameters_from(c)
     # To a frame whose plane at infinity is the last coordinate, where points have finite ones.
     frame = np.vstack([np.linalg.svd(c.a_inf[None])[2][1:], c.a_inf])
@@ -314,7 +312,6 @@ def _fitted(images: _Images, v: int) -> _Camera:
             if used.sum() < max(_LEAST, (1.0 - _MAX_OUTLIERS) * seen.sum()):
                 count, total = float((seen & ~used).sum()), float(seen.sum())
                 allowed = (Finding("outliers", amount=_MAX_OUTLIERS * total, unit="1"),)
-                of = Subject(views=(found.view[v],))
                 raise failed(
                     [Finding("refit_outliers", REFUSES, of, count, limit=total, unit="1", others=allowed)]
                 )
@@ -327,7 +324,7 @@ def _fitted(images: _Images, v: int) -> _Camera:
         root = inverse_root(J, np.linalg.norm(J, axis=0), gauge)
         along = J @ root
         if not (np.linalg.norm(along, axis=0) > 0.5).all():  # else of length one
-            raise WorkFailed(open_)
+            raise failed([open_])
         if k < _ROUNDS + _SETTLING:
             params = _stepped(params, v, -root @ (along.T @ change[:, 0]))
     G = root @ problem.whitened(params, along, used).T

@@ -99,11 +99,11 @@ def _teach(
             if calibration is not None and not start:
                 check = stage.checked(plan_inputs(settings), calibration, taught)
         except WorkFailed as error:
-            reason = " ".join(str(error).split()).removeprefix("teach: ")
+            reason = " ".join(error.reason.split())
             value = {"file": output.resolve(), "failed": "teach", "reason": reason}
             value["findings"] = list(error.findings)
             console.report(value, ["teach: failed; no file was written"])
-            raise WorkFailed(f"teach: {reason}", findings=error.findings) from error
+            raise WorkFailed(reason, stage="teach", findings=error.findings) from error
         write_whole(output, _TAUGHT + plain_yaml(taught.as_goal()))
     # Names are relative to the configuration, in the file and with --set.
     is_relative = config is not None and Path(config).resolve().parent == output.resolve().parent
@@ -406,7 +406,7 @@ def _validate(
     console.report(value, words)
     if not refusing:
         return
-    (one,) = refusing
+    one = refusing[0]
     again = f"projservo calibrate {target} --refit {''.join(one.subject.views[:1])} --data {data}"
     one = replace(one, subject=replace(one.subject, name=again))
     left_open, n = order_advice(calibration), len(calibration.joint_types)
@@ -414,7 +414,7 @@ def _validate(
     if order is not None and order.size == n * (n - 1):  # all reversed is the other mount
         left_open += "; no pose shows whether the cameras are on the tool (--mount) either"
     left_open = f"; {left_open}" if left_open else ""
-    raise failed([one], setup_of(calibration), f"{data}: ", left_open)
+    raise failed([one], setup_of(calibration), left_open, stage=str(data))
 
 
 def _position_errors(

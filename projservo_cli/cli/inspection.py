@@ -198,11 +198,12 @@ def _in_metres(
     from projservo_cli.config import load_config
     from projservo_cli.config.inputs import joints_of
     from projservo_cli.metric.frame import MetricParameters
-    from projservo_cli.metric.kinematic_errors import contradictions, kinematic_words
+    from projservo_cli.metric.kinematic_errors import contradictions, errors_found
     from projservo_cli.metric.opencv import opencv_cameras
-    from projservo_cli.records import TOOL, WorkFailed
+    from projservo_cli.records import TOOL
     from projservo_cli.results import ImageModel
     from projservo_cli.store import exports
+    from projservo_cli.words import failed, sentence
 
     calibration, config = ImageModel.of(run.calibration), load_config(run.path, text=run.configuration)
     length_m, ends, std = length
@@ -213,15 +214,15 @@ def _in_metres(
         words.append(
             f"known length {length_m:g} m ± ? (--metric-std): deviations of lengths leave its own out"
         )
-    wrong = "; ".join(contradictions(metric, None, measured=std is not None))
+    wrong = tuple(contradictions(metric, None, measured=std is not None))
     if model is not None and not wrong:
         errors = metric.errors_of(*model[:2])
         value["nominal"] = [error._asdict() for error in errors.joints]
         value |= {"length_error": errors.length, "length_error_std": errors.length_std}
-        words += kinematic_words(errors, metric.joint_types)
-        wrong = "; ".join(contradictions(metric, errors, measured=std is not None))
+        words += map(sentence, errors_found(errors, metric.joint_types))
+        wrong = tuple(contradictions(metric, errors, measured=std is not None))
     if wrong:
-        raise WorkFailed(f"export: {wrong}; check the known length, in m, and its ends, or the model")
+        raise failed(wrong, stage="export")
     if model is not None and model[2]:
         metric = metric.in_frames_of(*model[:2])
     if metric.mount == TOOL:

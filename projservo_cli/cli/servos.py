@@ -89,16 +89,17 @@ def _release(console: Console, *, config: str) -> None:
     Switches the torque of all its servos off, the gripper's too. The arm falls where nobody holds it.
     """
     from projservo_cli.files import text_of
-    from projservo_cli.records import WorkFailed
+    from projservo_cli.findings import REFUSES, Finding
+    from projservo_cli.words import failed
 
     text = text_of(Path(config), "a configuration", _MAX_BYTES)
     with _servos(console, config, text, whole=False) as servos:
         console.wait("take hold of the arm, and of what its gripper holds: they will be released")
         servos.release(all_of_them=True)
-        lost = ", ".join(map(servos.name, sorted(servos.lost)))
+        lost = tuple(map(servos.finding, sorted(servos.lost)))
     console.report({"released": servos.alive}, ["release: done" if not lost else "release: not of all"])
     if lost:
-        raise WorkFailed(f"release: no answer from {lost}: look at the cable to it, or switch the supply off")
+        raise failed([Finding("unreleased_servos", REFUSES, others=lost)], stage="release")
 
 
 @contextmanager

@@ -92,7 +92,7 @@ class VideoCamera:
         return f"the {self.name} camera (cameras.{self.name}.source: {self.settings.source})"
 
     def _failed(self, why: Finding) -> WorkFailed:
-        return words.failed([why], begin=f"{self.where}: ")
+        return words.failed([why], stage=self.where)
 
     def open(self) -> None:
         """Connect, and wait for the first frame; WorkFailed if there is none."""

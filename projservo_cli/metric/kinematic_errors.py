@@ -12,7 +12,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from projservo_cli.findings import REFUSES, Finding, Subject
+from projservo_cli.findings import NOTE, REFUSES, Finding, Subject
 from projservo_cli.geometry.displacements import (
     carried_screws,
     homogeneous,
@@ -329,7 +329,7 @@ _UNMEASURED, _ROUNDING = 0.0025, 1e-9
 _FARTHEST = 20.0
 
 
-def contradictions(metric: Metric, errors: KinematicErrors | None, *, measured: bool) -> Iterator[str]:
+def contradictions(metric: Metric, errors: KinematicErrors | None, *, measured: bool) -> Iterator[Finding]:
     """Yield what contradicts the known length: far cameras, readings of prismatic joints, links of a model.
 
     measured : whether the deviation of the length is known; otherwise one per cent passes.
@@ -341,30 +341,27 @@ def contradictions(metric: Metric, errors: KinematicErrors | None, *, measured: 
         size = float(np.linalg.norm(v))
         std = float(np.linalg.norm(of_axes[:, i, 3:] @ v)) / size
         if abs(size - 1.0) > _CONTRADICTED * np.hypot(std, least):
-            yield f"joint {i + 1} moves {size:.4g} ± {std:.1g} m for each m of its readings"
+            yield Finding("length_by_joint", REFUSES, Subject(joints=(int(i) + 1,)), size, std, unit="1")
     if errors is not None and abs(errors.length) > _CONTRADICTED * np.hypot(errors.length_std, least):
-        wrong = "short" if errors.length > 0.0 else "long"
-        share, std = 100.0 * abs(errors.length), 100.0 * errors.length_std
-        yield f"the known length is {share:.2g} % ± {std:.1g} % too {wrong} for the links of the model"
-    places = [
-        (f"the {view} camera", metric.carrier, T) for view, T in zip(metric.view, metric.poses, strict=True)
-    ]
+        code = "length_short" if errors.length > 0.0 else "length_long"
+        yield Finding(code, REFUSES, amount=errors.length, deviation=errors.length_std, unit="1")
     hand = "flange" if metric.mount == TOOL else "tool"
-    for what, frame, T in (*places, (f"the {hand} at readings of zero", "base", metric.body.tool)):
+    places = [
+        ("far_camera", Subject(views=(view,), name=metric.carrier), T)
+        for view, T in zip(metric.view, metric.poses, strict=True)
+    ]
+    for code, of, T in (*places, ("far_hand", Subject(name=hand), metric.body.tool)):
         if (far := float(np.linalg.norm(T[:3, 3]))) > _FARTHEST:
-            yield f"{what} is {far:.3g} m from the {frame}, {_FARTHEST:g} m allowed"
+            yield Finding(code, REFUSES, of, far, limit=_FARTHEST, unit="m")
 
 
-def kinematic_words(errors: KinematicErrors, joint_types: str) -> Iterator[str]:
+def errors_found(errors: KinematicErrors, joint_types: str) -> Iterator[Finding]:
     """Yield what to mend in a model: zeros of joints, then axes, of each the most significant first."""
     zeros = [one for one in errors.joints if one.zero is not None and one.zero_std is not None]
     for one in sorted(zeros, key=lambda one: -abs((one.zero or 0.0) / (one.zero_std or 1.0))):
-        scale, unit = (1e3, " mm") if joint_types[one.joint - 1] == "P" else (float(np.degrees(1.0)), "°")
-        zero, std = scale * (one.zero or 0.0), scale * (one.zero_std or 0.0)
-        summary = f"joint {one.joint}: zero off by {round(zero, 2) + 0.0:+.2f}{unit} ± {std:.2f}{unit}"
-        yield summary.replace("-", "\N{MINUS SIGN}")
+        of, unit = Subject(joints=(one.joint,)), "m" if joint_types[one.joint - 1] == "P" else "rad"
+        yield Finding("zero_off", NOTE, of, one.zero or 0.0, one.zero_std or 0.0, unit=unit)
     for one in sorted(errors.joints, key=lambda one: -one.offset_m / max(one.offset_std_m, 1e-12)):
-        yield (
-            f"joint {one.joint}: axis off by {1e3 * one.offset_m:.2f} mm ± {1e3 * one.offset_std_m:.2f} mm, "
-            f"{np.degrees(one.tilt_rad):.3f}° ± {np.degrees(one.tilt_std_rad):.3f}°"
-        )
+        tilt = Finding("axis_tilt", amount=one.tilt_rad, deviation=one.tilt_std_rad, unit="rad")
+        of = Subject(joints=(one.joint,))
+        yield Finding("axis_off", NOTE, of, one.offset_m, one.offset_std_m, unit="m", others=(tilt,))

@@ -351,7 +351,7 @@ class PluginRobot:
     def command(self, target: FloatArray, speed: FloatArray, due: float) -> None:
         """Send the set-point (n,), rad or m, with its speed (n,), per s, and when it is due, s."""
         if wrong := self._wrong(target, speed, due):
-            raise failed([wrong], begin=f"{self.name}: a command was not sent: ")
+            raise failed([wrong], stage=f"{self.name}: a command was not sent")
         sent = target.copy(), speed.copy(), due
         self._ask("command", lambda: self.robot.command(*sent))
         self._sent, self._due = target.copy(), due

@@ -80,7 +80,7 @@ class Session:
         for _ in range(LOOKS):
             watch.observe(self.steered.hold())
             if watch.moved:
-                raise failed([watch.moved], begin="nothing was taken: ")
+                raise failed([watch.moved], stage="nothing was taken")
         if not watch.seen:
             raise WorkFailed(
                 f"nothing was taken: no image shows the object {watch.name} where it is to be: look where it "

@@ -6,8 +6,10 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from projservo_cli.records import FloatArray, IntArray, WorkFailed
+from projservo_cli.findings import REFUSES, Finding, Subject
+from projservo_cli.records import FloatArray, IntArray
 from projservo_cli.robots.contract import PluginRobot, Reading
+from projservo_cli.words import failed
 
 # Drift of a joint, rad or m, and of an image, px rms, within which both count as still.
 STILL, _STILL_PX = 2e-5, 0.02
@@ -23,10 +25,8 @@ def at_rest(
     still, first = Standstill(settle_s), reading.t_q
     while not still.all(reading):
         if reading.t_q > first + settle_s + _PATIENCE_S:
-            raise WorkFailed(
-                f"{what}: {still.moving or 'the robot'} does not come to rest within {_PATIENCE_S:g} s: look "
-                "for what vibrates, creeps or flickers"
-            )
+            of = Subject(name=still.moving or "the robot")
+            raise failed([Finding("restless", REFUSES, of, limit=_PATIENCE_S, unit="s")], stage=what)
         reading = observe()
         yield reading
 

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from projservo_cli.calibration.detections import per_rad
+from projservo_cli.findings import Finding
 from projservo_cli.geometry.kinematics import joint_operators
 from projservo_cli.records import ByteArray, FloatArray
 from projservo_cli.settings.disturbance import Events, Faults, JointMoved, LostMarkers, StuckEncoder
@@ -484,7 +485,7 @@ class _Camera:
         return _Frame(middle, middle + self._clock, pixels, sigma)
 
 
-def obstruction_of(robot: object) -> str:
-    """Return the obstruction of an arm, if its simulation knows one; else empty."""
+def obstruction_of(robot: object) -> tuple[Finding, ...]:
+    """Return what obstructs an arm, where its simulation knows it."""
     servos = robot.world.servos if isinstance(robot, FaultyRobot) else None
-    return servos.obstruction if isinstance(servos, Physics) else ""
+    return servos.obstruction if isinstance(servos, Physics) else ()

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from projservo_cli.findings import LIMITS, Finding, Subject
 from projservo_cli.records import FloatArray, InputError, WorkFailed
 from projservo_cli.simulation.mjcf import mujoco
 from projservo_cli.simulation.rendering import RenderedModel
@@ -105,14 +106,11 @@ class Physics:
         return np.array(self._data.qpos[self._places])
 
     @property
-    def obstruction(self) -> str:
-        """Return the obstruction of the arm: contacts, saturated servos; else empty."""
-        weak = " and ".join(str(i + 1) for i in self._own if self._at_end(i))
-        obstructions = (
-            ("the arm touches: ", self._touching()),
-            ("at the end of what their servos can do: joint ", weak),
-        )
-        return "; ".join(said + named for said, named in obstructions if named)
+    def obstruction(self) -> tuple[Finding, ...]:
+        """Return what obstructs the arm: contacts, saturated servos."""
+        touching, weak = self._touching(), tuple(i + 1 for i in self._own if self._at_end(i))
+        found = [Finding("arm_touches", LIMITS, Subject(name=touching))] if touching else []
+        return *found, *([Finding("servos_at_end", LIMITS, Subject(joints=weak))] if weak else ())
 
     def _at_end(self, joint: int) -> bool:
         """Whether the actuator of a joint can do no more than it does."""

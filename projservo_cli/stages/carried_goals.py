@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from projservo_cli import words
 from projservo_cli.calibration.prediction import error_factor_with_model, require_covariance
 from projservo_cli.findings import REFUSES, Finding, Subject
 from projservo_cli.metric.frame import Metric, Scale
@@ -72,7 +73,7 @@ def carried_goal(
         found = DisplacedObject.of(c, carrier.numbers, [taught, now], metric)
         goal = found.carry(_goal(scenario, c))
     except WorkFailed as error:
-        raise WorkFailed(str(error).replace("objects:", f"objects.{carrier.name}:", 1)) from error
+        raise words.failed(error.findings, stage=f"objects.{carrier.name}") from error
     rigid, limits = found.coordinates == 6, carrier.limits
     found_now: dict[str, Any] = {
         "object_name": carrier.name,
@@ -90,11 +91,9 @@ def carried_goal(
     for unit in ("mm", "px"):
         key, at = f"max_goal_deviation_{unit}", found_now[f"goal_deviation_{unit}"]
         if at is not None and at > (most := getattr(limits, key)):
-            raise WorkFailed(
-                f"objects.{carrier.name}: the carried goal is known to {at:.2g} {unit} only ({most:g} at "
-                f"most): show more of its markers, nearer to the goal and to the cameras, average more "
-                f"frames, or raise objects.{key}"
-            )
+            per, of = {"mm": (1e-3, "m")}.get(unit, (1.0, unit)), Subject(name=key)
+            inexact = Finding("carried_inexact", REFUSES, of, per[0] * at, limit=per[0] * most, unit=per[1])
+            raise words.failed([inexact], stage=f"objects.{carrier.name}")
     return scenario.carried(found_now["s_carried"]), found_now
 
 

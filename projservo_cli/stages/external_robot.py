@@ -6,9 +6,10 @@ from functools import partial
 
 import numpy as np
 
-from projservo_cli import plugins
+from projservo_cli import plugins, words
 from projservo_cli.calibration.prediction import predict
 from projservo_cli.detection import finder_of
+from projservo_cli.findings import REFUSES, Finding, Subject
 from projservo_cli.geometry.algebra import mat
 from projservo_cli.hardware.camera_robot import Arm, CameraRobot
 from projservo_cli.image_size import image_sizes
@@ -163,19 +164,14 @@ def path_to(
     gap = np.abs(q - robot.reading.q)
     i, sag = int(np.argmax(gap / np.maximum(bounds.sag, STILL))), bounds.sag
     if gap[i] > max(sag[i], STILL) or (q != robot.target).any():
-        remedy = "free the robot, or check its sag and backlash (plant.max_steady_state_error_deg)"
-        if gap[i] > abs(q[i] - begun[i]) + sag[i]:
-            remedy = (
-                f"it moved away from there, from {bounds.text(i, begun[i])}: check its sign and unit, and "
-                "whether it can hold its load"
-            )
-        if obstruction := obstruction_of(robot.robot.robot):
-            remedy = f"{obstruction}: take joints that it can reach and hold"
-        raise WorkFailed(
-            f"{what}: joint {i + 1} was sent to {bounds.text(i, q[i])} and stands at "
-            f"{bounds.text(i, robot.reading.q[i])}, {bounds.text(i, gap[i], 3)} short: {remedy}; then run "
-            "the command again" + (" to continue" if what == "record" else "")
-        )
+        unit, obstructions = bounds.unit(i), obstruction_of(robot.robot.robot)
+        further = gap[i] > abs(q[i] - begun[i]) + sag[i]
+        code = "obstructed" if obstructions else "moved_away" if further else "stands_short"
+        found = Finding("joint_reading", amount=robot.reading.q[i], limit=begun[i], unit=unit)
+        of, others = Subject(joints=(i + 1,)), (found, *obstructions)
+        short = Finding(code, REFUSES, of, gap[i], limit=q[i], unit=unit, others=others)
+        again = "; then run the command again" + (" to continue" if what == "record" else "")
+        raise words.failed([short], end=again, stage=what)
 
 
 def simulated_robot(driven: Drive, joints: Joints, robot: FaultyRobot) -> PluginRobot:

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from projservo_cli.control.law import State
-from projservo_cli.findings import LIMITS, NOTE, Finding, Subject, told, usable
+from projservo_cli.findings import LIMITS, NOTE, REFUSES, Finding, Subject, told, usable
 from projservo_cli.geometry.algebra import as_array, vec
 from projservo_cli.geometry.displacements import composed_angle
 from projservo_cli.geometry.kernels import COORDINATES, RANK_TOLERANCE
@@ -33,7 +33,6 @@ from projservo_cli.records import (
     Plan,
     WorkFailed,
     in_sense,
-    in_unit,
 )
 from projservo_cli.robots.session import Session
 from projservo_cli.settings.task import Trajectory
@@ -113,11 +112,9 @@ def _require_in_span(model: Model, A: FloatArray, q_start: FloatArray, images: F
         q = least_squares(miss, q, args=(images[k],), method="lm", xtol=1e-12).x
     left = float(np.sqrt(np.mean(np.sum(miss(q, images[-1]).reshape(-1, 2) ** 2, axis=1))))
     if not left <= _LEFT_PX:
-        raise WorkFailed(
-            f"the task does not lie in what {len(q)} joints can do: the nearest they bring the face is "
-            f"{left:.3g} px rms from its goal images, more than the {_LEFT_PX:g} px that noise may leave; "
-            "choose a goal by joint readings, or one that moves the face as these joints do"
-        )
+        joints = (Finding("joints", amount=float(len(q)), unit="1"),)
+        off = Finding("beyond_joints", REFUSES, amount=left, limit=_LEFT_PX, unit="px", others=joints)
+        raise failed([off])
 
 
 def run(
@@ -181,11 +178,12 @@ def _to_any_goal(scenario: Scenario) -> Plan:
     names = tuple(one.name for one in ends.incidences)
     if not len(goals):
         (left,) = errors_px(task.incidences, forward_kinematics(model, nearest)[None])
-        told = ", ".join(f"{name} {px:.3g} px" for name, px in zip(names, left, strict=True) if px > MET_PX)
-        raise WorkFailed(
-            f"no joints within their limits meet all incidences; the nearest leave {told}: leave one out, or "
-            "teach the goal elsewhere"
-        )
+        missed = [
+            Finding("incidence", subject=Subject(name=name), amount=px, limit=MET_PX, unit="px")
+            for name, px in zip(names, left.tolist(), strict=True)
+            if px > MET_PX
+        ]
+        raise failed([Finding("unmet_incidences", REFUSES, others=tuple(missed))])
     plans, failures = [], []
     for q in goals[:_GOALS]:
         H = forward_kinematics(model, q)
@@ -236,8 +234,8 @@ def _require_taught_since(scenario: Scenario, calibration: Calibration) -> None:
     if images.joints is not None:
         q = images.joints.values(calibration.joint_types)
         if fault := detected_fault(calibration, q, numbers, seen, size):
-            raise failed([fault], setup_of(calibration), _CHANGED, "; teach it again")
-        _require_rigid(rigid_fit(calibration, q, *whole), calibration.view, "teach it again")
+            raise failed([fault], setup_of(calibration), "; teach it again", stage=_CHANGED)
+        _require_rigid(rigid_fit(calibration, q, *whole), setup_of(calibration), "teach it again")
         return
     stated = images.sigma_px(scenario.numbers[: scenario.m], scenario.inputs.face)
     sigma = scenario.noise_px if stated is None else stated
@@ -245,49 +243,38 @@ def _require_taught_since(scenario: Scenario, calibration: Calibration) -> None:
     shown = numbers[known].tolist(), seen[:, known]
     q, median = joints_showing(calibration, *shown, scenario.exact.q_start, near_px)
     enough, fit = len(q) >= COORDINATES, rigid_fit(calibration, q, *whole)
-    check = "check which image is of which camera, and the marker numbers; then take them again"
     if enough and median > near_px:
-        raise WorkFailed(
-            f"the goal images fit no pose of the arm: the nearest leaves {fit.moved_px:.3g} px rms a marker; "
-            f"{check}"
-        )
+        raise failed([Finding("goal_out_of_reach", REFUSES, amount=fit.moved_px, limit=near_px, unit="px")])
     advice = (
         "take the images again, or give their deviations (sigma_left_px and sigma_right_px of "
         "task.goal.images)"
     )
-    _require_rigid(fit, calibration.view, advice)
+    _require_rigid(fit, setup_of(calibration), advice)
     alone = fit.off_px * (np.isfinite(whole[0][..., 0]) & ~fit.seen)
     v, k = np.unravel_index(int(np.argmax(alone)), alone.shape)
     if alone[v, k] > near_px:
-        raise WorkFailed(
-            f"the goal images fit no pose of the arm: marker {calibration.marker[k]} is {alone[v, k]:.3g} "
-            f"px off in the {calibration.view[v]} one, {near_px:.3g} px are allowed; {check}"
-        )
+        of = Subject(views=(calibration.view[v],), markers=(int(calibration.marker[k]),))
+        raise failed([Finding("goal_marker_off", REFUSES, of, alone[v, k], limit=near_px, unit="px")])
     if enough and (fault := detected_fault(calibration, q, numbers, seen, size, sigma)):
-        raise failed([fault], setup_of(calibration), _CHANGED, f"; {advice}")
+        raise failed([fault], setup_of(calibration), f"; {advice}", stage=_CHANGED)
     if not enough and not fit.reached:
-        units = scenario.joints.units
-        there = ", ".join(in_unit(x, unit, 4) for x, unit in zip(q.tolist(), units, strict=True))
-        raise WorkFailed(
-            f"the goal is a pose that {len(q)} joints do not reach: the nearest, at joints {there}, is "
-            f"{math.degrees(fit.turn):.2g} deg and {fit.moved_px:.3g} px rms a marker off; move the arm to "
-            "the goal by hand and teach it, or set task.goal.joints to these readings"
-        )
+        units = ["m" if kind == "P" else "rad" for kind in calibration.joint_types]
+        there = [Finding("joint_reading", amount=x, unit=unit) for x, unit in zip(q, units, strict=True)]
+        turn = Finding("turn", amount=fit.turn, unit="rad")
+        others = (turn, *there)
+        raise failed([Finding("goal_unreached", REFUSES, amount=fit.moved_px, unit="px", others=others)])
 
 
-_CHANGED = "the goal was taught after a change since the calibration: "
+_CHANGED = "the goal was taught after a change since the calibration"
 
 
-def _require_rigid(fit: RigidFit, view: Sequence[str], advice: str) -> None:
+def _require_rigid(fit: RigidFit, setup: Setup, advice: str) -> None:
     """Refuse goal images of which chance does not explain what the nearest pose of the tool leaves."""
     if not fit.agrees:
-        (u, v), others = fit.shift, f"{view[-1]} one" if len(view) == 2 else "others"
-        shifted = f", as if the {view[fit.view]} image were shifted by ({u:.2g}, {v:.2g}) px against the "
-        raise WorkFailed(
-            f"the goal images fit no pose of the tool: the nearest leaves {fit.rms_px:.3g} px rms a "
-            f"coordinate, their deviations explain {fit.limit_px:.3g} px"
-            f"{shifted + others if len(view) > 1 else ''}; {advice}"
-        )
+        of = Subject(views=(setup.view[fit.view],))
+        shift = tuple(Finding("shift", amount=x, unit="px") for x in fit.shift) * (len(setup.view) > 1)
+        off = Finding("goal_not_rigid", REFUSES, of, fit.rms_px, limit=fit.limit_px, unit="px", others=shift)
+        raise failed([off], setup, f"; {advice}")
 
 
 def plan_task(

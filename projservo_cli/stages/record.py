@@ -430,7 +430,7 @@ class _Sight:
         period, waited = robot.bounds.period, 0.0
         while wrong := self._wrong(reading.s[None], Subject()):
             if waited >= self.inputs.trials.settle_s:  # a camera may need some time for its first image
-                raise words.failed([wrong], self.setup, "record: ", "; nothing was moved")
+                raise words.failed([wrong], self.setup, "; nothing was moved", stage="record")
             time.sleep(period)
             waited, reading = waited + period, robot.read()
 
@@ -451,7 +451,7 @@ class _Sight:
                 ", or choose another calibration.reference or a smaller calibration.amplitude_deg; then "
                 "start again with --force (force=True)"
             )
-            raise words.failed([wrong], self.setup, "record: ", end)
+            raise words.failed([wrong], self.setup, end, stage="record")
 
     @property
     def setup(self) -> Setup:

@@ -15,6 +15,7 @@ import numpy as np
 
 from projservo_cli.calibration.prediction import predict
 from projservo_cli.control.law import Gains
+from projservo_cli.findings import Finding
 from projservo_cli.geometry.kinematics import project
 from projservo_cli.image_size import image_sizes
 from projservo_cli.laws import BODY_LAWS, LAW_SPECS
@@ -113,14 +114,12 @@ class Scenario:
         return asked or V
 
     @property
-    def untested(self) -> str:
-        """Return the reason why images are not tested against the calibration; empty if they are."""
+    def untested(self) -> tuple[Finding, ...]:
+        """Return why images are not tested against the calibration, if they are not."""
         if not self.inputs.tests_images:
-            return "stop.innovation_threshold is 0"
+            return (Finding("no_image_test"),)
         assert self.calibration is not None
-        if not self.calibration.has_covariance:
-            return "the calibration has no covariance, which the method bundle_adjustment gives"
-        return ""
+        return () if self.calibration.has_covariance else (Finding("no_covariance"),)
 
     @property
     def joints_at_goal(self) -> FloatArray:

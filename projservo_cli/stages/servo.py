@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 
 from projservo_cli import plugins
 from projservo_cli.control.law import ERRORS, LOST, MAX_PARTS, OK, TAU_AFFINE, THETA_S, Gains
-from projservo_cli.findings import LIMITS, NOTE, REFUSES, Finding, Subject, told
+from projservo_cli.findings import LIMITS, NOTE, REFUSES, Finding, Subject
 from projservo_cli.geometry.algebra import as_array, mat
 from projservo_cli.geometry.kernels import COORDINATES
 from projservo_cli.geometry.kinematics import forward
@@ -223,7 +223,7 @@ class LawRun:
 
     def _stopped(self, what: str, fault: Finding, *, refutes: bool) -> WorkFailed:
         """Return the failure of a robot that a fault stopped before the run."""
-        return failed([fault], self.setup, f"{what} ", refutes=refutes)
+        return failed([fault], self.setup, begin=f"{what} ", refutes=refutes)
 
     def _require_images(self, driven: DrivenRobot, what: str, seeing: int) -> Finding | None:
         """Refuse to move a robot of which fewer than so many cameras show markers, unless that was asked for.
@@ -237,7 +237,7 @@ class LawRun:
                 f": uncover {all_of(driven.robot.view)} and look at the light, or move the arm by hand to "
                 "where they see the tags; --blind (blind=True) drives it without images"
             )
-            raise failed(found, self.setup, f"{what} ", mend)
+            raise failed(found, self.setup, mend, begin=f"{what} ")
         return unseen
 
     def in_python(
@@ -410,8 +410,8 @@ class LawRun:
         center = np.asarray(H @ np.array(center_of(self.plant.M, self.plant.center)))[:, :3]
         driven = self.driven
         dark = _blind_view(log.s[:rows], scenario.view, WINDOW) if driven and arrived(self.verdict) else ()
-        lost = text([self.unseen] if self.unseen else dark, self.setup)
-        untested = "" if driven is None else scenario.untested
+        lost = [self.unseen] if self.unseen else dark
+        untested = () if driven is None else scenario.untested
         found = (*_reason(self, joint, remaining), *self.replannings)
         if driven is not None:  # the log has the predicted rest of the robot instead of readings
             read = _whole(driven.readings, rows)
@@ -466,7 +466,7 @@ class LawRun:
             unplanned=self.unplanned,
             **self._incidences(),
             **_stated_mm(self, views),
-            untested="; ".join(filter(None, (untested, lost))),
+            untested=text((*untested, *lost), self.setup),
             overruns=None if driven is None else driven.steered.overruns,
             force=None if driven is None or not driven.forces else _whole(driven.forces, rows),
             latency=None if driven is None else _whole(driven.delays, rows),
@@ -619,8 +619,8 @@ def _reason(run: LawRun, joint: int, remaining: tuple[float | None, float | None
         parts += [] if turn is None else [Finding("turn", amount=math.radians(turn), unit="rad")]
         yield replace(own, code="remaining", others=tuple(parts))
     yield from _blind_view(log.s[: steps + 1], run.scenario.view, limits.stall_periods)
-    if run.driven is not None and (obstruction := obstruction_of(run.driven.robot.robot)):
-        yield told(obstruction)
+    if run.driven is not None:
+        yield from obstruction_of(run.driven.robot.robot)
 
 
 def _grown(run: LawRun, own: Finding, at_step: Finding) -> Finding:

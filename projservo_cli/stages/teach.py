@@ -207,7 +207,7 @@ def _require_still(bounds: Bounds, before: FloatArray, after: FloatArray, code: 
     i = int(np.argmax(off / most))
     if off[i] > most[i]:
         found = Finding(code, REFUSES, Subject(joints=(i + 1,)), off[i], limit=most[i], unit=bounds.unit(i))
-        raise words.failed([found], begin="teach: ", end="; nothing was written")
+        raise words.failed([found], end="; nothing was written", stage="teach")
 
 
 def _put_to(inputs: TeachInputs, simulated: SimulatedRobot, q: FloatArray) -> FaultyRobot:
@@ -277,7 +277,7 @@ def require_start(taught: _Taught) -> None:
         few = Finding(
             "few_shared", REFUSES, amount=taught.shared, limit=len(taught.marker), unit="1", others=parts
         )
-        raise words.failed([few], Setup(view=taught.view), "teach: ")
+        raise words.failed([few], Setup(view=taught.view), stage="teach")
 
 
 def require_objects(taught: _Taught, *, one_goal: bool) -> Finding | None:
@@ -291,7 +291,8 @@ def require_objects(taught: _Taught, *, one_goal: bool) -> Finding | None:
             subject = Subject(markers=tuple(numbers), name=name)
             hidden = Finding("hidden_object", LIMITS, subject, len(numbers), limit=RIGID, unit="1")
             if one_goal:
-                raise words.failed([replace(hidden, severity=REFUSES)], Setup(view=taught.view), "teach: ")
+                refusing = replace(hidden, severity=REFUSES)
+                raise words.failed([refusing], Setup(view=taught.view), stage="teach")
             return hidden
     return None
 
@@ -312,4 +313,4 @@ def require_face(face: Sequence[int], taught: _Taught, least: int | None = None)
     if unseen := [(number, side) for number, side in taught.unseen if number in {*face} - shared]:
         number, side = unseen[0]
         hidden = Finding("hidden_face", REFUSES, Subject(views=(side,), markers=(number,)))
-        raise words.failed([hidden], Setup(view=taught.view), "teach: ")
+        raise words.failed([hidden], Setup(view=taught.view), stage="teach")

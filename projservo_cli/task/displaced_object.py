@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
 from projservo_cli.calibration.prediction import require_covariance
+from projservo_cli.findings import REFUSES, Finding, Subject
 from projservo_cli.geometry.displacements import homogeneous
 from projservo_cli.geometry.lens import undistort
 from projservo_cli.geometry.stereo import optical_centers
@@ -33,10 +34,12 @@ from projservo_cli.records import (
     IntArray,
     WorkFailed,
 )
-from projservo_cli.task.look_bundle import Bundle, BundleFit, Look, LookRig, differ, generators
+from projservo_cli.task.look_bundle import Bundle, BundleFit, Look, LookRig, differ, generators, unknown
 
-# Number of markers that six coordinates need, and that twelve need.
+# Number of markers that six coordinates need, and that twelve need; findings on it by these numbers.
 RIGID, _AFFINE = 3, 4
+# Times of the looks that have to show an object.
+_TAUGHT, _NOW = "when the goal was taught", "now"
 # Deviation of a turn, rad, or of a stretch, above which it is not seen: first order means nothing there.
 _UNSEEN = 0.3
 # Difference of χ² below which two poses fit alike: the better one is the wrong one in 1 of 1,000 cases.
@@ -78,10 +81,10 @@ class _Search:
         """Number of markers that a look needs."""
         return RIGID if self.rig.rigid else _AFFINE
 
-    def numbers(self, markers: BoolArray) -> str:
-        """Numbers of markers (k,), in words."""
-        some = np.asarray(self.marker)[markers].tolist()
-        return f"marker{'s' * (len(some) > 1)} {', '.join(map(str, some)) or 'none'}"
+    def of(self, markers: BoolArray, name: str = "", look: int | None = None) -> Subject:
+        """Markers (k,) as the subject of a finding, with the time or the number of the look at them."""
+        poses = () if look is None else (look + 1,)
+        return Subject(markers=tuple(np.asarray(self.marker)[markers].tolist()), name=name, poses=poses)
 
     def bundle(self, looks: Sequence[int], markers: BoolArray, X: FloatArray, fixed: int = -1) -> Bundle:
         """Least squares of looks at markers (k,) near points (k, 4); of known points if no look is fixed."""
@@ -106,7 +109,10 @@ class _Search:
         X = self.points(base, np.eye(4))
         known = np.isfinite(X[:, 0])
         if known.sum() < self.least:
-            raise WorkFailed(self._no_shape(known, base))
+            alone = len(self.looks[0].s) == 1
+            of = Subject() if alone else self.of(known, look=base)
+            code = "object_without_size" if alone else "object_without_shape"
+            raise unknown(Finding(code, REFUSES, of, float(known.sum()), limit=self.least, unit="1"))
         fit = BundleFit.settled(self.bundle([base], known, X, 0), X[known], np.eye(4)[None])
         placed, last = _Placed(fit, (base,), known), len(self.looks) - 1
         for look in dict.fromkeys((last, 0, *range(1, last))):
@@ -119,35 +125,30 @@ class _Search:
 
     def _with(self, placed: _Placed, look: int) -> _Placed:
         """The object with one more look at it."""
-        when = "when the goal was taught" if look == 0 else "now"
+        when = _TAUGHT if look == 0 else _NOW
         X = np.full((len(self.marker), 4), np.nan)
         X[placed.known] = placed.fit.X
         shown = placed.known & (self.views[look] > 0)
         if shown.sum() < self.least:
-            raise WorkFailed(self._too_few(shown, when))
+            of, seen = self.of(shown, when), float(shown.sum())
+            raise unknown(Finding("object_hidden", REFUSES, of, seen, limit=self.least, unit="1"))
         found = []
         for start in self._structures(placed, X):
             T, _ = self.bundle([look], shown, start).poses(start[shown], self.rig.turns)
             found += [self._joined(placed, look, start, there) for there in T[:_MINIMA]]
         if not found:
-            raise WorkFailed(
-                f"objects: {self.numbers(shown)} fit no place before the cameras {when}: markers may be "
-                "numbered otherwise, or the cameras have moved; look again"
-            )
+            raise unknown(Finding("object_unplaced", REFUSES, self.of(shown, when)))
         best, *others = sorted(found, key=lambda one: one.fit.cost)
         at_look = best.looks.index(look)
         deviation, axis = best.fit.unseen(at_look)
         if deviation > _UNSEEN:
-            raise WorkFailed(self._not_seen(best, shown, when, deviation, axis))
+            raise unknown(self._not_seen(best, self.of(shown, when), deviation, axis))
         for other in others:
             apart = other.fit.cost - best.fit.cost
             ends = [one.fit.T[at_look] @ X[shown].T for one in (best, other)]
             if apart < _UNDECIDED and differ(ends[0].T, ends[1].T):
-                raise WorkFailed(
-                    f"objects: the images {when} fit two places of the object, χ² {apart:.3g} apart "
-                    f"({_UNDECIDED} decide): {self.numbers(shown)} do not show which way it is tilted; show "
-                    "it to a second camera, nearer, or more of its markers off one plane"
-                )
+                of = self.of(shown, when)
+                raise unknown(Finding("object_in_two_places", REFUSES, of, apart, limit=_UNDECIDED))
         return best
 
     def _structures(self, placed: _Placed, X: FloatArray) -> list[FloatArray]:
@@ -174,55 +175,18 @@ class _Search:
         fit = BundleFit.settled(bundle, points[known], np.array([place for _, place in at]))
         return _Placed(fit, looks, known)
 
-    def _no_shape(self, known: BoolArray, base: int) -> str:
-        """Return the reason why the shape of the object is not known."""
-        if len(self.looks[0].s) == 1:
-            return (
-                "objects: one camera tells the size of an object from its distance in no number of looks, so "
-                "not how far it has moved: watch it with a second camera"
-            )
-        return (
-            f"objects: two cameras together see {self.numbers(known)} at best (look {base + 1} of "
-            f"{len(self.looks)}), and its shape needs {self.needed}: turn it towards both cameras"
-        )
-
-    @property
-    def needed(self) -> str:
-        """Markers that a look needs, and why."""
-        if self.rig.rigid:
-            return f"{RIGID} off one line"
-        return f"{_AFFINE} off one plane, as the joints leave the metric open: 12 coordinates instead of 6"
-
-    def _too_few(self, shown: BoolArray, when: str) -> str:
-        """Which freedom fewer markers than needed leave."""
-        left = (
-            "it is hidden or turned away",
-            "all its turns are open",
-            "its turn about their line is open",
-            "its stretch across them is open",
-        )
-        return (
-            f"objects: of known shape is seen {when}: {self.numbers(shown)}; {left[int(shown.sum())]}: show "
-            f"{self.needed}"
-        )
-
-    def _not_seen(self, placed: _Placed, shown: BoolArray, when: str, std: float, axis: FloatArray) -> str:
-        """Which freedom the images leave, by the direction (3 or 9,) of its largest deviation."""
+    def _not_seen(self, placed: _Placed, shown: Subject, std: float, axis: FloatArray) -> Finding:
+        """Return the freedom that images leave, by the direction (3 or 9,) of its largest deviation."""
         if not self.rig.rigid:
-            return (
-                f"objects: {self.numbers(shown)} do not show {when} how the object is stretched "
-                f"(± {std:.2g}, {_UNSEEN} at most); show {self.needed}"
-            )
+            return Finding("object_stretched", REFUSES, shown, std, limit=_UNSEEN, unit="1")
         numbers, X = np.asarray(self.marker)[placed.known], placed.fit.X[:, :3]
         lines = X[:, None] - X
         cosine = np.abs(lines @ axis) / np.maximum(np.linalg.norm(lines, axis=-1), 1e-300)
         i, j = sorted(np.unravel_index(int(np.argmax(cosine)), cosine.shape))
-        about = f" about the line of markers {numbers[i]} and {numbers[j]}" if cosine[i, j] > _ALONG else ""
-        degrees = f"± {min(np.degrees(std), 180.0):.2g}°, {np.degrees(_UNSEEN):.2g}° at most"
-        return (
-            f"objects: {self.numbers(shown)} do not show {when} how the object is turned{about} ({degrees}); "
-            "show more markers, off one line, or show them from nearer"
-        )
+        line = (Finding("object_line", subject=Subject(markers=(int(numbers[i]), int(numbers[j])))),)
+        about = line if cosine[i, j] > _ALONG else ()
+        at_most = min(std, np.pi)
+        return Finding("object_turned", REFUSES, shown, at_most, limit=_UNSEEN, unit="rad", others=about)
 
 
 def _elsewhere(rig: LookRig, fit: BundleFit, most: float) -> tuple[float, int, int] | None:
@@ -265,11 +229,8 @@ def _of_one_object(
         times, look, k = off[0], found_in[off[1]], int(np.flatnonzero(known)[off[2]])
         seen = np.isfinite(looks[look].s).all(axis=-1).any(axis=0)
         if (1 + len(left_out)) * _SHARE > seen.sum():
-            raise WorkFailed(
-                f"objects: markers do not lie on the object as they did: residuals {times:.3g} times the "
-                f"noise ({most:g} at most), most at marker {marker[k]}: it has come off or slipped, the "
-                "object is another one, or it moved while images were taken"
-            )
+            of = Subject(markers=(int(marker[k]),))
+            raise unknown(Finding("object_deformed", REFUSES, of, times, limit=most, unit="1"))
         left_out.append(int(marker[k]))
         s = looks[look].s.copy()
         s[:, k] = np.nan
@@ -386,7 +347,7 @@ class DisplacedObject:
         H = fit.T[-1] @ to_taught @ tool.T[0]
         placed = tool.X @ H.T
         if not (placed @ rig.P[0, :, 2].T > 0.0).all():
-            raise WorkFailed("objects: with the object, the goal of the tool has moved behind a camera")
+            raise unknown(Finding("carried_behind", REFUSES))
         s = rig.pixels(placed)[0]
         # All markers in all views; a motion of the object takes the tool along, as one of the tool itself.
         out = rig.bundle([Look(s, np.ones(s.shape[:2]))], tool.bundle.E)
@@ -469,25 +430,16 @@ def _tool_at(rig: LookRig, goal: Look) -> BundleFit:
     bundle = rig.bundle([goal], generators(rig.turns, M[:, :3].mean(axis=0)))
     seen = bundle.weight[0].any(axis=0)
     if seen.sum() < RIGID:
-        raise WorkFailed(
-            f"objects: the goal shows {int(seen.sum())} markers of the tool, and its pose needs {RIGID}: "
-            "teach it where the cameras see more"
-        )
+        raise unknown(Finding("goal_few_markers", REFUSES, amount=float(seen.sum()), limit=RIGID, unit="1"))
     T, cost = rig.bundle([goal.of(seen)], bundle.E).poses(M[seen], rig.turns)
     if not len(T):
-        raise WorkFailed(
-            "objects: the images of the goal fit no pose of the tool before the cameras: teach again"
-        )
+        raise unknown(Finding("goal_unplaced", REFUSES))
     fit = BundleFit(bundle, M, T[:1], float(cost[0]))
     deviation, _ = fit.unseen(0)
     if deviation > _UNSEEN:
-        raise WorkFailed(
-            f"objects: the goal does not show how the tool is turned (± {np.degrees(deviation):.2g}°, "
-            f"{np.degrees(_UNSEEN):.2g}° at most): teach it where the cameras see more markers, off one line"
-        )
+        at_most = min(deviation, np.pi)
+        raise unknown(Finding("goal_turned", REFUSES, amount=at_most, limit=_UNSEEN, unit="rad"))
     if len(cost) > 1 and cost[1] - cost[0] < _UNDECIDED:
-        raise WorkFailed(
-            f"objects: the images of the goal fit two poses of the tool, χ² {cost[1] - cost[0]:.3g} apart "
-            f"({_UNDECIDED} decide): teach it where two cameras see it, or more markers off one plane"
-        )
+        apart = float(cost[1] - cost[0])
+        raise unknown(Finding("goal_in_two_poses", REFUSES, amount=apart, limit=_UNDECIDED))
     return fit

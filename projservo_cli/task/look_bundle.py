@@ -14,11 +14,13 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from projservo_cli.calibration.prediction import error_factor_with_model, projection_derivative
+from projservo_cli.findings import REFUSES, Finding
 from projservo_cli.geometry.displacements import cross_matrix
 from projservo_cli.geometry.lens import distort, undistort
 from projservo_cli.metric.frame import ProjectiveParameters, changes_of, invariant_form
 from projservo_cli.records import BoolArray, Calibration, FloatArray, WorkFailed
 from projservo_cli.task.body import make_body
+from projservo_cli.words import failed
 
 # Singular value over the largest, below which joints leave the plane at infinity open, or preserve a form.
 _OPEN = 1e-6
@@ -38,6 +40,11 @@ _FIRST_STEPS, _PLACES = 12, 6
 _PROBE = 0.01
 # Turns that the search for a pose starts from, (24, 3) rotation vectors: none is farther than 63° from one.
 _TURNS = Rotation.create_group("O").as_rotvec()
+
+
+def unknown(one: Finding) -> WorkFailed:
+    """Return the error that a finding on an object, or on a goal that it carries, is."""
+    return failed([one], stage="objects")
 
 
 class Look(NamedTuple):
@@ -71,10 +78,7 @@ class LookRig(NamedTuple):
         models = ProjectiveParameters.around(c, c.model().lens, error_factor_with_model(c))
         U, sizes, _ = np.linalg.svd(np.concatenate(np.moveaxis(models.H_hat, 1, 0), axis=-1))
         if sizes[0, 2] < _OPEN * sizes[0, 0]:
-            raise WorkFailed(
-                "objects: the joints do not determine the plane at infinity, so nothing tells how far an "
-                "object has moved: record motions of two joints whose axes are not parallel"
-            )
+            raise unknown(Finding("object_open_infinity", REFUSES))
         a_inf = U[..., 3] / (U[..., 3] @ c.M.mean(axis=0))[:, None]
         D = np.linalg.svd(a_inf[:1])[2][1:]
         G = np.concatenate([np.broadcast_to(D, (len(a_inf), 3, 4)), a_inf[:, None]], axis=1)

@@ -56,14 +56,15 @@ def row(one: Finding, setup: Setup) -> dict[str, str]:
 def failed(
     findings: Iterable[Finding],
     setup: Setup = _SETUP,
-    begin: str = "",
     end: str = "",
     *,
+    begin: str = "",
+    stage: str = "",
     refutes: bool = False,
 ) -> WorkFailed:
-    """Return the error that findings are, told between a beginning such as ``teach: `` and an end."""
+    """Return the error that findings are, told between a beginning and an end, after the work that failed."""
     found = tuple(findings)
-    return WorkFailed(f"{begin}{text(found, setup)}{end}", refutes=refutes, findings=found)
+    return WorkFailed(f"{begin}{text(found, setup)}{end}", stage=stage, refutes=refutes, findings=found)
 
 
 def text(findings: Iterable[Finding], setup: Setup = _SETUP) -> str:

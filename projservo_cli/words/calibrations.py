@@ -149,6 +149,15 @@ CALIBRATION = {
     "circular_readings": Row(
         "readings of {joints} pass {part} to {of_part}: taken as a range of {amount}, as given {limit}"
     ),
+    "few_postures": Row(
+        "{count} {postures} show {rest} numbers of the arm, less than the {of_rest} required: several arms "
+        "fit them, and no residual tells which",
+        "record {total} or more, better twice as many, in which every joint moves",
+    ),
+    "joint_undetermined": Row(
+        "{joints} is not determined: near the reference its predicted images err by {amount} times the pixel "
+        "noise"
+    ),
     "placeholders": Row("{stands}: no camera saw that, so it was taken as unseen", "empty these cells"),
     "turned_board": Row(
         "the board looks the same turned by {amount}: {of_images}, and were turned right",

@@ -82,9 +82,104 @@ OF_PLAN = {
         "and visibility is that of a plane between them",
         "name others in markers.face",
     ),
+    "no_image_test": Row("stop.innovation_threshold is 0"),
+    "no_covariance": Row("the calibration has no covariance, which the method bundle_adjustment gives"),
     "object_far": Row(
         "objects.{name} has moved by {amount}, more than {limit}",
         "look whether the goal is free there, then confirm it (--confirm), or raise objects.{key}",
     ),
 }
-PLANS = OF_MOTION | OF_SEARCH | OF_PLAN
+_CHECK = "check which image is of which camera, and the marker numbers; then take them again"
+# Of a goal that no joints, or no pose of the tool, show.
+OF_GOAL = {
+    "beyond_joints": Row(
+        "the task does not lie in what {rest} joints can do: the nearest they bring the face is {amount} rms "
+        "from its goal images, more than the {limit} that noise may leave",
+        "choose a goal by joint readings, or one that moves the face as these joints do",
+    ),
+    "incidence": Row("{name} {amount}"),
+    "unmet_incidences": Row(
+        "no joints within their limits meet all incidences; the nearest leave {unshown}",
+        "leave one out, or teach the goal elsewhere",
+    ),
+    "goal_out_of_reach": Row(
+        "the goal images fit no pose of the arm: the nearest leaves {amount} rms a marker", _CHECK
+    ),
+    "goal_marker_off": Row(
+        "the goal images fit no pose of the arm: marker {numbers} is {amount} off in the {view} one, {limit} "
+        "are allowed",
+        _CHECK,
+    ),
+    "goal_unreached": Row(
+        "the goal is a pose that {count_others} joints do not reach: the nearest, at joints {there_read}, is "
+        "{part} and {amount} rms a marker off",
+        "move the arm to the goal by hand and teach it, or set task.goal.joints to these readings",
+    ),
+    "goal_not_rigid": Row(
+        "the goal images fit no pose of the tool: the nearest leaves {amount} rms a coordinate, their "
+        "deviations explain {limit}{shifted}"
+    ),
+}
+_NEARER = "show more of its markers, off one line, or show them from nearer"
+# Of an object that carries a goal; names are those of the looks at it.
+OF_OBJECT = {
+    "object_open_infinity": Row(
+        "the joints do not determine the plane at infinity, so nothing tells how far an object has moved",
+        "record motions of two joints whose axes are not parallel",
+    ),
+    "object_without_size": Row(
+        "one camera tells the size of an object from its distance in no number of looks, so not how far it "
+        "has moved",
+        "watch it with a second camera",
+    ),
+    "object_without_shape": Row(
+        "two cameras together see {which} at best (look {poses}), and its shape needs {needed}",
+        "turn it towards both cameras",
+    ),
+    "object_hidden": Row("of known shape is seen {name}: {which}; {freedom}", "show {needed}"),
+    "object_unplaced": Row(
+        "{which} fit no place before the cameras {name}",
+        "look whether they are numbered otherwise or the cameras have moved, and look again",
+    ),
+    "object_in_two_places": Row(
+        "the images {name} fit two places of the object, χ² {amount} apart ({limit} decide): {which} do not "
+        "show which way it is tilted",
+        "show it to a second camera, nearer, or more of its markers off one plane",
+    ),
+    "object_stretched": Row(
+        "{which} do not show {name} how the object is stretched (± {amount}, {limit} at most)",
+        "show 4 off one plane, as the joints leave the metric open",
+    ),
+    "object_turned": Row(
+        "{which} do not show {name} how the object is turned{about} (± {amount}, {limit} at most)", _NEARER
+    ),
+    "object_deformed": Row(
+        "markers do not lie on the object as they did: residuals {amount} times the noise ({limit} at most), "
+        "most at {which}",
+        "look whether it has come off or slipped, the object is another one, or it moved while images were "
+        "taken",
+    ),
+    "carried_behind": Row(
+        "with the object, the goal of the tool has moved behind a camera",
+        "put the object nearer to its place",
+    ),
+    "carried_inexact": Row(
+        "the carried goal is known to {amount} only ({limit} at most)",
+        "show more of its markers, nearer to the goal and to the cameras, average more frames, or raise "
+        "objects.{name}",
+    ),
+    "goal_few_markers": Row(
+        "the goal shows {count} markers of the tool, and its pose needs {total}",
+        "teach it where the cameras see more",
+    ),
+    "goal_unplaced": Row("the images of the goal fit no pose of the tool before the cameras", "teach again"),
+    "goal_turned": Row(
+        "the goal does not show how the tool is turned (± {amount}, {limit} at most)",
+        "teach it where the cameras see more markers, off one line",
+    ),
+    "goal_in_two_poses": Row(
+        "the images of the goal fit two poses of the tool, χ² {amount} apart ({limit} decide)",
+        "teach it where two cameras see it, or more markers off one plane",
+    ),
+}
+PLANS = OF_MOTION | OF_SEARCH | OF_PLAN | OF_GOAL | OF_OBJECT

@@ -176,6 +176,7 @@ ROBOTS: dict[str, Row] = (
         lost_port=("{name}; servos with power go on to their last set-points, and hold there",),
         silent_arm=("no servo answers any more: all joints may fall", "hold the arm, and look at its supply"),
         silent_servos=("{servos}: no answer any more: it may fall with its load", "check the cable to it"),
+        unreleased_servos=("no answer from {servos}", "look at the cable to it, or switch the supply off"),
         set_point_beyond=("{servo}: {count} counts are beyond {rest} to {of_rest}",),
         torque_leap=(
             "{servo} turned by {amount} when its torque came on ({limit} at most)",
@@ -250,6 +251,21 @@ ROBOTS: dict[str, Row] = (
             "{joints} read {part} and {amount} within {of_rest_s}",
             "check its encoder and unit, or what moved it",
         ),
+        restless=(
+            "{name} does not come to rest within {limit}",
+            "look for what vibrates, creeps or flickers",
+        ),
+        stands_short=(
+            "{sent}",
+            "free the robot, or check its sag and backlash (plant.max_steady_state_error_deg)",
+        ),
+        moved_away=(
+            "{sent}: it moved away from there, from {of_part}",
+            "check its sign and unit, and whether it can hold its load",
+        ),
+        obstructed=("{sent}: {obstructions}", "take joints that it can reach and hold"),
+        arm_touches=("the arm touches: {name}",),
+        servos_at_end=("at the end of what their servos can do: {joints}",),
         dropped=("the {name} holds nothing, and should hold the object {of_name}", "look where that lies"),
         stays=("the {name} stays at {amount}",),
     )

@@ -4,6 +4,7 @@ from projservo_cli.words.rows import Row
 
 _MORE = "record more poses"
 _CHECK = "check the joint readings and the marker numbers"
+_LENGTH = "check the known length, in m, and its ends, or the model"
 VALIDATIONS = {
     "held_out": Row("held-out images err {ratio} times as much as the covariance predicts"),
     "poses_disagree": Row("the poses disagree by more than noise, as from joint readings or a lens"),
@@ -25,10 +26,24 @@ VALIDATIONS = {
         "if it moved, fit it again: {name}",
     ),
     "median_limit": Row(
-        "{limit} allowed: 3 times the stated error of {part} and the noise of these images, {of_part}, "
-        "together"
+        "{limit} allowed: {number_of_last} times the stated error of {part} and the noise of these images, "
+        "{of_part}, together"
+    ),
+    "poses_open": Row("the other poses do not determine the robot"),
+    "open_camera": Row(
+        "{count} detections of the {view} camera at {rest} poses determine no camera ({total} required, not "
+        "in one plane)",
+        "add poses in which several joints move, and markers",
     ),
     "contradicted_view": Row("{view} camera: median {amount}, {limit} allowed"),
+    "length_by_joint": Row("{joints} moves {amount_m} ± {deviation_m} m for each m of its readings", _LENGTH),
+    "length_short": Row("the known length is {size} too short for the links of the model", _LENGTH),
+    "length_long": Row("the known length is {size} too long for the links of the model", _LENGTH),
+    "far_camera": Row("the {view} camera is {amount} from the {name}, {limit} allowed", _LENGTH),
+    "far_hand": Row("the {name} at readings of zero is {amount} from the base, {limit} allowed", _LENGTH),
+    "zero_off": Row("{joints}: zero off by {signed}"),
+    "axis_off": Row("{joints}: axis off by {fixed}, {unshown}"),
+    "axis_tilt": Row("{fixed}"),
     "refit_outliers": Row(
         "{count} of {total} detections of the {view} camera do not fit ({rest} allowed)", _CHECK
     ),

@@ -34,6 +34,18 @@ _ORIGINS = {
     "stated, by body": "that the sigmas of the markers state, times {amount:.3g} as a rigid body shows",
 }
 
+# Markers that a look at an object needs, and why, by their number; what fewer leave open, by theirs.
+_NEEDED = {
+    3.0: "3 off one line",
+    4.0: "4 off one plane, as the joints leave the metric open: 12 coordinates instead of 6",
+}
+_FREEDOMS = {
+    0.0: "it is hidden or turned away",
+    1.0: "all its turns are open",
+    2.0: "its turn about their line is open",
+    3.0: "its stretch across them is open",
+}
+
 
 class Told:
     """Findings that one line tells, the first for all; values are looked up as in a dictionary."""
@@ -224,6 +236,29 @@ def _enough_see(told: Told) -> str:
     return {1: "the camera sees", 2: "both cameras see"}.get(cameras, f"all {cameras} cameras see")
 
 
+def _fixed(one: Finding, sign: str = "") -> str:
+    """Format an amount with its deviation to hundredths, of tilts to thousandths."""
+    (factor, unit), digits = _UNITS[one.unit], 3 if one.code == "axis_tilt" else 2
+    amount = round(factor * one.amount, digits) + 0.0
+    return f"{amount:{sign}.{digits}f}{unit} ± {factor * one.deviation:.{digits}f}{unit}"
+
+
+def _shifted(told: Told) -> str:
+    """Say how an image is shifted against the other, or the others."""
+    if not told.one.others:
+        return ""
+    by = ", ".join(f"{one.amount:.2g}" for one in told.one.others)
+    others = f"{told.setup.view[-1]} one" if len(told.setup.view) == 2 else "others"
+    return f", as if the {told['view']} image were shifted by ({by}) px against the {others}"
+
+
+def _about_line(told: Told) -> str:
+    """Say about which line of markers an object may be turned."""
+    return "".join(
+        f" about the line of {numbered('marker', one.subject.markers)}" for one in told.one.others[:1]
+    )
+
+
 def servo_name(subject: Subject) -> str:
     """Name a servo by its joint."""
     return f"{numbered('joint', subject.joints)} ({subject.name})" if subject.joints else subject.name
@@ -328,6 +363,7 @@ VALUES: dict[str, Callable[[Told], object]] = {
     "of_rest_s": lambda told: quantity(told.rest.limit, "s"),
     "exact": lambda told: quantity(told.one.amount, told.one.unit, _DIGITS),
     "exact_limit": lambda told: quantity(told.one.limit, told.one.unit, _DIGITS),
+    "obstructions": lambda told: "; ".join(told.others("sentence")[1:]),
     "between": lambda told: " to ".join(
         quantity(end, told.rest.unit, _DIGITS) for end in (told.rest.amount, told.rest.limit)
     ),
@@ -353,6 +389,22 @@ VALUES: dict[str, Callable[[Told], object]] = {
     "sizes": lambda told: joined(
         f"{one.amount:.0f}x{one.limit:.0f} {one.subject.views[0]}" for one in told.one.others
     ),
+    "which": lambda told: f"marker{'s' * (len(told.subject.markers) > 1)} {told['each_number']}",
+    "each_number": lambda told: ", ".join(map(str, told.subject.markers)) or "none",
+    "needed": lambda told: _NEEDED.get(told.one.limit, ""),
+    "freedom": lambda told: _FREEDOMS.get(told.one.amount, ""),
+    "about": _about_line,
+    "signed": lambda told: _fixed(told.one, "+").replace("-", "\N{MINUS SIGN}"),
+    "fixed": lambda told: _fixed(told.one),
+    "amount_m": lambda told: f"{told.one.amount:.4g}",
+    "deviation_m": lambda told: f"{told.one.deviation:.1g}",
+    "number_of_last": lambda told: f"{told.one.others[-1].amount:g}",
+    "postures": lambda told: (
+        f"postures of joints {told.joints[0]} to {told.joints[-1]}" if told.joints else "poses"
+    ),
+    "count_others": lambda told: len(told.one.others) - 1,
+    "there_read": lambda told: ", ".join(quantity(one.amount, one.unit, 4) for one in told.one.others[1:]),
+    "shifted": _shifted,
     "key": lambda told: {"m": "max_displacement_m"}.get(told.one.unit, "max_rotation_deg"),
     # Of faults, and of reasons of runs.
     "causes": lambda told: "; or ".join(
@@ -386,6 +438,10 @@ VALUES: dict[str, Callable[[Told], object]] = {
     "frame_ms": lambda told: f"{1e3 / told.one.limit:.0f}",
     "in_ms": lambda told: f"{1e3 * told.one.amount:.0f}",
     "of_name": lambda told: told.rest.subject.name,
+    "sent": lambda told: (
+        f"{told['joints']} was sent to {told['exact_limit']} and stands at "
+        f"{quantity(told.rest.amount, told.rest.unit, _DIGITS)}, {told['amount']} short"
+    ),
     "instead": lambda told: "" if math.isnan(told.one.amount) else f", it has {told.one.amount:.3g}",
     "devices": lambda told: (
         ", ".join(one.subject.name for one in told.one.others) or "none: look at the cable"

@@ -112,7 +112,7 @@ def test_all_that_answer_are_released_and_the_others_named(arm, capsys):
     arm.bus.faults.missing = (2, 6)
     arm.script += [lambda: "\n"]
     assert run(["release", "-c", "arm.yaml"]) == 1
-    assert "no answer from joint 2 (servo 2), servo 6" in capsys.readouterr().err
+    assert "no answer from joint 2 (servo 2) and servo 6: look" in capsys.readouterr().err
     assert [i for i, servo in arm.bus.servos.items() if servo.on] == [2, 6]
 
 

@@ -257,19 +257,26 @@ class Shaking(Arm):
 
 
 @pytest.mark.parametrize(
-    ("kind", "message"),
+    ("kind", "code", "numbers"),
     [
-        (Stuck, r"joint 1 was sent to 4.18.* rad and stands at 3.7 rad, 0.48\d rad short"),
-        (Backwards, r"joint 2 was sent to -1.678.*moved away from there, from -1.378.* rad: check its sign"),
-        (Shaking, r"joint 6 does not come to rest within 20 s"),
+        (Stuck, "stands_short", (1, 0.485, 4.185, 3.7)),
+        (Backwards, "moved_away", (2, 0.557, -1.678, -1.121)),
+        (Shaking, "restless", ("joint 6", 20.0)),
     ],
 )
-def test_a_robot_that_does_not_arrive_is_reported_and_the_rest_kept(kind, message):
+def test_a_robot_that_does_not_arrive_is_reported_and_the_rest_kept(kind, code, numbers):
     config = load_config(UR5, TEN)
     recording = stage.new_recording(config, Path("t.csv"))
     robot = kind(config)
-    with pytest.raises(WorkFailed, match=message):
+    with pytest.raises(WorkFailed) as caught:
         stage.record(config, recording, driven(config, robot))
+    (one,) = caught.value.findings
+    assert one.code == code
+    if code == "restless":
+        assert (one.subject.name, one.limit) == numbers
+    else:
+        found = (*one.subject.joints, one.amount, one.limit, one.others[0].amount)
+        assert found == pytest.approx(numbers, abs=0.02)
     assert robot.calls == ["open", "stop", "close"]
     assert recording.pending
     if recording.done:

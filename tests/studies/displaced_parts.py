@@ -118,7 +118,8 @@ def seen_tool(truth, goal):
 def shown(config, q, *, now):
     """Whether the arm touches nothing at joints (n,), and both images show the face and all of the part."""
     truth = truth_of(config)
-    if "touches" in obstruction_of(robot_by_itself(config, truth, q, 0.0, 0, 0)):
+    obstructions = obstruction_of(robot_by_itself(config, truth, q, 0.0, 0, 0))
+    if any(one.code == "arm_touches" for one in obstructions):
         return False
     once = config.model_copy(update={"noise": type(config.noise)()})
     s = looked(once, q, (0, 0), now=now)

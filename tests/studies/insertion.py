@@ -209,7 +209,7 @@ def clear(folder, ends):
     config = config_of(folder, "drawn", hole_of(truth, ends[2]))
     truth = truth_of(config)
     robots = [robot_by_itself(config, truth, q, 0.0, 0, 0) for q in ends[:2]]
-    if any("touches" in obstruction_of(robot) for robot in robots):
+    if any(one.code == "arm_touches" for robot in robots for one in obstruction_of(robot)):
         return False
     images = (taught_images(config, q, 0) for q in ends)
     return all(None not in (*shown["left"][:4], *shown["right"][:4]) for shown in images)

@@ -101,7 +101,7 @@ def drawn(config):
             if not all(_is_large(truth, q, least) for q in ends):
                 continue
             robots = [robot_by_itself(config, truth, q, 0.0, 0, 0) for q in ends]
-            free = not any("touches" in obstruction_of(robot) for robot in robots)
+            free = not any(one.code == "arm_touches" for robot in robots for one in obstruction_of(robot))
             found = ends if free and all(_shows(config, truth, q, least) for q in ends) else None
         yield {"seed": seed} | row_of(found)
 

@@ -15,7 +15,9 @@ from projservo_cli.calibration.bundle_adjustment import LeastSquares
 from projservo_cli.calibration.detections import MIN_MOTION, SAME_READING, Detections
 from projservo_cli.calibration.prediction import Parameters
 from projservo_cli.calibration.robust_fit import OPEN_DIRECTION, Solution
-from projservo_cli.records import FloatArray, IntArray, WorkFailed
+from projservo_cli.findings import REFUSES, Finding, Subject
+from projservo_cli.records import FloatArray, IntArray
+from projservo_cli.words import failed
 
 # Increase of χ² by another order above which the images decide against it: ten standard deviations.
 _DECISIVE = 100.0
@@ -103,10 +105,6 @@ def require_poses(detections: Detections) -> None:
         if shown >= needed or j - i == 1:  # of a single joint range and noise decide
             continue
         first, last = sorted(detections.numbers[[i, j - 1]].tolist())
-        what, enough = f"postures of joints {first} to {last}", -(-needed // _OF_MOTION) + 1
-        raise WorkFailed(
-            f"{poses} {'poses' if j - i == n else what} show {shown} numbers of the arm, {_OF_MOTION} a "
-            f"motion between two, less than the {needed} required ({own} unknown and {needed - own} to "
-            f"spare): several arms fit them, and no residual tells which; record {enough} or more, "
-            f"better {2 * enough}, in which every joint moves"
-        )
+        of = Subject() if j - i == n else Subject(joints=tuple(range(first, last + 1)))
+        enough, by = -(-needed // _OF_MOTION) + 1, (Finding("numbers", amount=shown, limit=needed, unit="1"),)
+        raise failed([Finding("few_postures", REFUSES, of, poses, limit=enough, unit="1", others=by)])

@@ -22,8 +22,8 @@ from projservo_cli.calibration.joint_noise import quantile
 from projservo_cli.calibration.prediction import Parameters
 from projservo_cli.calibration.robust_fit import Expected, Solution
 from projservo_cli.findings import LIMITS, NOTE, REACH_M, REACH_RAD, REFUSES, Finding, Subject
-from projservo_cli.records import BoolArray, Errors, FloatArray, IntArray, WorkFailed, apart
-from projservo_cli.words import line
+from projservo_cli.records import BoolArray, Errors, FloatArray, IntArray, apart
+from projservo_cli.words import failed
 
 # Noise of predictions at the reach, in units of the pixel noise, above which a joint is undetermined.
 UNDETERMINED_NOISE = 1000.0
@@ -262,11 +262,9 @@ def _noise_of_joints(
     i = int(np.argmax(noise))
     if noise[i] > UNDETERMINED_NOISE:
         (why,) = weak_joints(np.array([i]), span, needed, detections, np.zeros(len(span)))
-        raise WorkFailed(
-            f"joint {detections.numbers[i]} is not determined: near the reference its predicted images err "
-            f"by {noise[i]:.3g} times the pixel noise; {line(why, detections.setup)}",
-            findings=[replace(why, severity=REFUSES)],
-        )
+        of, most = Subject(joints=(int(detections.numbers[i]),)), UNDETERMINED_NOISE
+        open_ = Finding("joint_undetermined", REFUSES, of, noise[i], limit=most, unit="1")
+        raise failed([open_, replace(why, severity=REFUSES)], detections.setup)
     weak = noise > WEAK_NOISE
     if weak.any() and solution.problem.tau is not None:  # by the joints in the data, whatever their noise
         exact = replace(solution, problem=solution.problem.with_noise(None))

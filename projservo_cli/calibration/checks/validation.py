@@ -29,7 +29,7 @@ from projservo_cli.records import (
     Observation,
     WorkFailed,
 )
-from projservo_cli.words import lines, setup_of, text
+from projservo_cli.words import failed, lines, setup_of, text
 
 # Minimum number of parts in a cross-validation.
 _MIN_FOLDS = 2
@@ -41,7 +41,7 @@ _BLOCK_RATIO = 1.3
 _SPOILS = 1.1
 # Minimum number of detections of a marker in the other poses for its prediction.
 _MIN_READINGS = 4
-_OPEN = "the other poses do not determine the robot"
+_OPEN = Finding("poses_open", REFUSES)
 # Median held-out error, in the stated error and the noise of the images together, from which it contradicts.
 _CONTRADICTED = 3.0
 # Variance of a median of normal numbers over that of their mean.
@@ -96,7 +96,7 @@ def cross_validate(
         done += 1
         progress(done, total)
 
-    residual, predicted, failed = _of_parts(solution, part, sigma_px, on_fold)
+    residual, predicted, lost = _of_parts(solution, part, sigma_px, on_fold)
     distance = np.linalg.norm(residual, axis=3)
     statistics = _distance_statistics(distance[np.isfinite(distance)])
     expected = _expected_px(predicted)
@@ -107,13 +107,13 @@ def cross_validate(
         of_blocks[f"{name}_rms_px"] = _distance_statistics(length[np.isfinite(length)])["rms_px"]
         of_blocks[f"{name}_predicted_px"] = _expected_px(spread)
     others = np.array([_of_others(solution, v, part, residual, sigma_px, on_fold) for v in alone])
-    found = tuple(_on_held_out(statistics["rms_px"], expected, len(failed), of_blocks))
+    found = tuple(_on_held_out(statistics["rms_px"], expected, len(lost), of_blocks))
     found += tuple(_on_others(detections.view, others)) if len(others) else ()
     return CrossValidation(
         folds=folds,
         seed=seed,
         unit=unit,
-        failed=tuple(failed),
+        failed=tuple(lost),
         reason=text(found),
         findings=found,
         others_px=others if len(others) else None,
@@ -192,19 +192,19 @@ def _of_parts(
     detections = solution.problem.detections
     shape = (len(detections.q), len(detections.seen), detections.marker.size, 2)
     residual, predicted = np.full(shape, np.nan), np.full(shape, np.nan)
-    failed = []
+    lost = []
     for fold in range(int(part.max()) + 1):
         try:
             rows, difference, deviation = _held_out_residuals(solution, part == fold, sigma_px)
         except WorkFailed as error:
-            failed.append(f"part {fold + 1}: {error}")
+            lost.append(f"part {fold + 1}: {error}")
         else:
             for v in range(len(rows)):
                 at = np.flatnonzero(rows[v])
                 where = detections.pose_of[at], v, detections.marker_of[at]
                 residual[where], predicted[where] = difference[v, at], deviation[v, at]
         on_fold()
-    return residual, predicted, failed
+    return residual, predicted, lost
 
 
 def _divide(detections: Detections, folds: int, rng: np.random.Generator) -> tuple[IntArray, str]:
@@ -253,7 +253,7 @@ def _held_out_residuals(
     params = dataclasses.replace(solution.params, M=solution.params.M[known])
     found = fit_inliers(problem, params, solution.sigma_px)
     if found is None:
-        raise WorkFailed(_OPEN)
+        raise failed([_OPEN])
     found, kept = found.determined()
     known[known] = kept
     place = held_out[whole.pose_of] & known[whole.marker_of]
@@ -262,7 +262,7 @@ def _held_out_residuals(
     variance = sum((part**2).sum(axis=-1) for part in test.predicted(found.params, found.errors()))
     # A direction that the other poses leave open keeps its value of the whole fit.
     if np.sqrt(variance[test.detections.seen].mean()) > UNDETERMINED_NOISE:
-        raise WorkFailed(_OPEN)
+        raise failed([_OPEN])
     if tau is not None:  # joints of a held-out pose have their own noise
         variance += ((test.joint_derivative(found.params) * tau) ** 2).sum(axis=-1)
     difference, error = np.zeros((2, *whole.seen.shape, 2))
@@ -271,7 +271,7 @@ def _held_out_residuals(
 
 
 def _on_held_out(
-    rms: float | None, expected: float | None, failed: int, blocks: Mapping[str, Any]
+    rms: float | None, expected: float | None, lost: int, blocks: Mapping[str, Any]
 ) -> Iterator[Finding]:
     """Tell how the held-out error compares with the predicted one, and where blocks of poses err more."""
     if rms is None or expected is None:
@@ -281,8 +281,8 @@ def _on_held_out(
     ratio = rms / expected
     if ratio > WARN_RATIO:
         yield Finding("poses_disagree", LIMITS, amount=ratio, limit=WARN_RATIO)
-    if failed:
-        yield Finding("parts_lost", LIMITS, amount=failed, unit="1")
+    if lost:
+        yield Finding("parts_lost", LIMITS, amount=lost, unit="1")
     for name in _BLOCKS:
         apart, predicted = blocks.get(f"{name}_rms_px"), blocks.get(f"{name}_predicted_px")
         if apart is not None and predicted is not None and apart > _BLOCK_RATIO * max(ratio, 1.0) * predicted:
@@ -355,7 +355,8 @@ def residual_statistics(calibration: Calibration, observation: Observation) -> d
 
 def median_limit(found: Mapping[str, Any]) -> Finding:
     """Return the limit of the median of residuals, and what that is of, by their statistics."""
-    parts = (Finding("errors", amount=found["stated_px"], limit=found["noise_px"], unit="px"),)
+    errors = Finding("errors", amount=found["stated_px"], limit=found["noise_px"], unit="px")
+    parts = errors, Finding("factor", amount=_CONTRADICTED)
     return Finding(
         "median_limit", NOTE, amount=found["median_px"], limit=found["limit_px"], unit="px", others=parts
     )
