@@ -16,6 +16,8 @@ from projservo_cli.records import VIEWS, BoolArray, FloatArray, InputError
 
 BEHIND = -1e9
 """Distance, px, from the border of an image of what no camera shows."""
+FACTORS = (0.25, 1.0 / 3.0, 0.5, 2.0 / 3.0, 0.75, 0.8, 1.25, 4.0 / 3.0, 1.5, 2.0, 3.0, 4.0)
+"""Ratios of the sizes that cameras have."""
 ImageSize = tuple[int, int] | tuple[tuple[int, int], ...] | Mapping[str, tuple[int, int]]
 """Width and height of the images, px: of all views, or of one each, in order or by name."""
 

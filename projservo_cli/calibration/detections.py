@@ -207,6 +207,13 @@ class Detections:
         """Select the observations at some poses (K,); the lists of poses and markers stay."""
         return self.rows(keep[self.pose_of])
 
+    def resized(self, onset: int, factor: float) -> "Detections":
+        """Images from a row of poses on by a factor larger; the middle of their first pixel is at zero."""
+        later = (self.pose_of >= onset)[:, None]
+        return dataclasses.replace(
+            self, pixels=np.where(later, factor * (self.pixels + 0.5) - 0.5, self.pixels)
+        )
+
     def of_markers(self, keep: BoolArray) -> "Detections":
         """Select markers (m,) and their observations."""
         left = self.rows(keep[self.marker_of])

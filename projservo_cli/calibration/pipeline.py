@@ -26,12 +26,12 @@ from projservo_cli.calibration.checks.refusal import (
     MUCH,
     contradiction,
     deviation,
-    joint_at_fault,
     other_motion,
     refusal,
     straight_joints,
     unexplained,
 )
+from projservo_cli.calibration.checks.relabelling import relabelled
 from projservo_cli.calibration.detections import (
     Detections,
     require_images,
@@ -76,8 +76,10 @@ from projservo_cli.words import judged, with_findings
 _METHODS = ("bundle_adjustment", "closed_form")
 # Fitted over expected noise above which a fit that passes may still have one joint at fault.
 _DOUBTFUL_RATIO = 2.0
-# Maximum share of the noise that a change of one joint leaves if that joint is at fault.
-_DOUBTFUL_SHARE = 0.5
+# Motion of images by the noise of joints over pixel noise, from which it may hide what is not as given.
+_DOUBTFUL_JOINTS = 10.0
+# Maximum share of the noise that a relabelling leaves if it is right, and if data as given are refuted.
+_DOUBTFUL_SHARE, _REFUTED_SHARE = 0.5, 0.2
 # Maximum noise over that of a fit as given, of one with a joint of the other type for which the images speak.
 _AS_GOOD = 1.05
 # Minimum share of the squared residuals that makes a lens the likely cause of a misfit.
@@ -280,21 +282,25 @@ def _maximum_likelihood(
         result = _refined(solution, epipolar, expected, frame, limit_px)
     except Misfit as refused:
         # The joints of a simulation are as configured, so none is at fault.
-        cause = None if expected.known else joint_at_fault(start, REFUSE_RATIO * expected.sigma_px)
-        if cause is None:
+        found = None if expected.known else relabelled(start, REFUSE_RATIO * expected.sigma_px)
+        if found is None:
             raise
-        raise Misfit.by([cause, *refused.findings], whole) from None
+        raise Misfit.by([found.finding, *refused.findings], whole) from None
     if not expected.known and (straight := straight_joints(solution)):
         seen = undistorted(search.problem.detections, solution.params.lens).of_pair()
         there = LeastSquares.of(seen, start.problem.q_reference)
         start = dataclasses.replace(start, problem=there, epipolar=epipolar)
-        if cause := joint_at_fault(start, _AS_GOOD * solution.sigma_px, straight):
-            no_turn = Finding("no_turn", REFUSES, cause.subject, solution.sigma_px, unit="px")
-            raise Misfit.by([cause, no_turn], whole)
-    cause = None
-    if not expected.known and expected.ratio(solution) > _DOUBTFUL_RATIO:
-        cause = joint_at_fault(start, _DOUBTFUL_SHARE * solution.sigma_px)
-    ahead = [] if cause is None else [dataclasses.replace(cause, severity=LIMITS)]
+        if found := relabelled(start, _AS_GOOD * solution.sigma_px, straight):
+            no_turn = Finding("no_turn", REFUSES, found.finding.subject, solution.sigma_px, unit="px")
+            raise Misfit.by([found.finding, no_turn], whole)
+    ahead = []
+    left_px = float(np.hypot(solution.sigma_px, solution.joint_effect()[1]))
+    doubtful = expected.ratio(solution) > _DOUBTFUL_RATIO or left_px > _DOUBTFUL_JOINTS * expected.sigma_px
+    if not expected.known and doubtful:
+        doubted = relabelled(start, _DOUBTFUL_SHARE * left_px)
+        if doubted is not None:
+            severity = REFUSES if doubted.noise_px < _REFUTED_SHARE * left_px else LIMITS
+            ahead.append(dataclasses.replace(doubted.finding, severity=severity))
     if epipolar.sigma_px < expected.min_px:
         ahead.append(Finding("exact_images", LIMITS, amount=epipolar.sigma_px, unit="px"))
     result = with_findings(result, filter(None, [_worst_view(result), note]), ahead)

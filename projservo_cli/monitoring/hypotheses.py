@@ -9,6 +9,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve, expm
 
 from projservo_cli.calibration.prediction import Parameters, from_reference, in_chain_order
+from projservo_cli.image_size import FACTORS
 from projservo_cli.monitoring.frame_pairs import FramePair
 from projservo_cli.monitoring.innovation_tests import ErrorModel, Residual, Sums
 from projservo_cli.records import CORNERS, BoolArray, FloatArray, IntArray
@@ -23,9 +24,8 @@ _STEPS, _HALVINGS, _EPSILON = 8, 6, 1e-6
 _NEAR_PX = 5.0
 # Causes of several parameters that are fitted, the likeliest after one step; a fall of χ² that ends a fit.
 _FITTED, _FALLS = 8, 0.05
-# Starts of a joint that was homed again, factors of images of another size.
+# Starts of a joint that was homed again.
 _TURNS = 12
-_FACTORS = (0.25, 1.0 / 3.0, 0.5, 2.0 / 3.0, 0.75, 0.8, 1.25, 4.0 / 3.0, 1.5, 2.0, 3.0, 4.0)
 # By so much a link may flex under its load, rad, which looks like a joint that slipped.
 _MOST_FLEXIBLE = np.radians(3.0)
 # Numbers of all joints, views or markers of a cause, and of some of several.
@@ -378,7 +378,7 @@ def _image_causes(count: int, centre: FloatArray | None) -> Iterator[_Cause]:
     for v, some in _every_and_all(count):
         views = np.isin(np.arange(count), some).astype(np.float64)
         yield _Cause("shifted", v, _start(2), partial(shifted, views=views), views=some)
-        yield _Cause("sized", v, np.array(_FACTORS)[:, None], partial(sized, views=views), views=some)
+        yield _Cause("sized", v, np.array(FACTORS)[:, None], partial(sized, views=views), views=some)
         if v >= 0:
             start = _start(3 if centre is None else 1)
             yield _Cause("focused", v, start, partial(focused, views=views), views=some)

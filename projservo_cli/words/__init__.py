@@ -18,7 +18,10 @@ _SETUP = Setup()
 _LEVELS = {NOTE: "fine", LIMITS: "warning", REFUSES: "fault"}
 # Maximum number of deviations from the model in advice.
 _MAX_NAMED = 3
-_CAUSES = ("other_mount", "images_before_readings", "images_after_readings", "joint_type", "standing_joint")
+_CAUSES = (
+    *("other_mount", "images_before_readings", "images_after_readings", "joint_type", "standing_joint"),
+    *("exchanged_joints", "full_coupling", "joint_unit", "image_size_changed"),
+)
 # Findings of which one line names all that are alike.
 _TOGETHER = ("placeholders", "hopeless_joint", "joint_together", "joint_in_few_poses", "little_motion")
 # Those that the reason of a calibration or its stated error says, and advice does not repeat.

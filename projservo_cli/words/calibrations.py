@@ -198,6 +198,26 @@ CALIBRATION = {
         "check the types of joints, --joints or joint_types ({name} would fit)",
         limit="joint types",
     ),
+    "exchanged_joints": Row(
+        "by the images {joints} have the readings of each other",
+        "list joints in their order along the arm, from its base",
+        limit="the order of joints",
+    ),
+    "full_coupling": Row(
+        "by the images joint {of[0]} turns joint {of[1]} by {full}, as a parallelogram or a belt does",
+        "fit that: --joint-model coupling:{of[0]}-{of[1]}",
+        limit="a coupling of joints",
+    ),
+    "joint_unit": Row(
+        "by the images readings of {joints} are {name}",
+        "give all joints in one unit, --joint-unit (data.joint_unit)",
+        limit="the unit of joints",
+    ),
+    "image_size_changed": Row(
+        "from pose {poses} on images are {times_as} as large as before",
+        "record again at one resolution, or remove the poses before or after",
+        limit="images of two sizes",
+    ),
     "standing_joint": Row(
         "by the images {joints} stands still while its readings move",
         "check that they are its own",

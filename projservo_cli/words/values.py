@@ -398,6 +398,8 @@ VALUES: dict[str, Callable[[Told], object]] = {
     "fixed": lambda told: _fixed(told.one),
     "amount_m": lambda told: f"{told.one.amount:.4g}",
     "deviation_m": lambda told: f"{told.one.deviation:.1g}",
+    "full": lambda told: f"{100.0 * told.one.amount:+.0f} %".replace("-", "\N{MINUS SIGN}"),
+    "times_as": lambda told: "half" if told.one.amount == 0.5 else f"{told.one.amount:.3g} times",
     "number_of_last": lambda told: f"{told.one.others[-1].amount:g}",
     "postures": lambda told: (
         f"postures of joints {told.joints[0]} to {told.joints[-1]}" if told.joints else "poses"

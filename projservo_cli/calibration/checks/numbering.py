@@ -1,4 +1,4 @@
-"""Views that contradict each other: tags exchanged or images late in one of them, or one that moved.
+"""Images that contradict each other: tags exchanged, late or of another size, or a camera that moved.
 
 A robot fits such a table with half of these detections rejected: only the epipolar geometry shows it.
 """
@@ -14,6 +14,7 @@ from projservo_cli.calibration.epipolar import OUTLIER, Epipolar, ImageFrame, Im
 from projservo_cli.calibration.single_view import RigidBody
 from projservo_cli.findings import REFUSES, Finding, Subject
 from projservo_cli.geometry.displacements import homogeneous
+from projservo_cli.image_size import FACTORS
 from projservo_cli.records import BoolArray, FloatArray, IntArray, Observation, WorkFailed
 from projservo_cli.words import failed
 
@@ -32,6 +33,9 @@ _OF_FEW = 15.0
 # Share of the detections of a pose that misfit the geometry of others where a camera moved, and minimum
 # number of such poses.
 _MISFIT, _LEAST_MOVED = 0.5, 5
+# Minimum number of poses before and after images change their size, number of onsets that are tried, and
+# noise of images of one size over that as they are.
+_LEAST_RESIZED, _ONSETS, _ONE_SIZE = 4, 5, 0.3
 # Maximum number of tags whose own geometry is tried.
 _MAX_TAGS = 6
 # Corners of a tag, numbered 4 t to 4 t + 3.
@@ -48,15 +52,20 @@ def checked_geometry(detections: Detections, frame: ImageFrame, rng: np.random.G
     Raises WorkFailed naming the tags or markers, the view that is late or the pose at which one moved, or as
     ``Epipolar.of`` does.
     """
-    if len(detections.pair) == 1:
-        return RigidBody.of(detections, frame)
+    alone = len(detections.pair) == 1
     try:
-        found = Epipolar.of(detections, rng)
+        found = RigidBody.of(detections, frame) if alone else Epipolar.of(detections, rng)
     except WorkFailed:
-        _require_alike(detections, _by_tags(detections))
-        _require_one_pose(detections, _noise_px(detections))
-        _require_one_rig(detections)
+        noise_px = np.inf if alone else _noise_px(detections)
+        _require_one_size(detections, frame, noise_px)
+        if not alone:
+            _require_alike(detections, _by_tags(detections))
+            _require_one_pose(detections, noise_px)
+            _require_one_rig(detections)
         raise
+    _require_one_size(detections, frame, found.sigma_px)
+    if not isinstance(found, Epipolar):
+        return found
     order = _true_order(detections, found, OUTLIER)
     if found.sigma_px > _MUCH_NOISE_PX and (order == np.arange(order.size)).all():
         order = _by_tags(detections)
@@ -91,6 +100,52 @@ def _require_one_pose(detections: Detections, noise_px: float) -> None:
             names = [detections.view[v] for v in detections.pair]
             subject = Subject(views=(names[late], names[1 - late]))
             raise failed([Finding("late_view", REFUSES, subject, shifted_px, limit=limit_px, unit="px")])
+
+
+def _require_one_size(detections: Detections, frame: ImageFrame, noise_px: float) -> None:
+    """Refuse images that are of another size from a pose on: so their noise is far less.
+
+    noise_px : of the images as they are.
+    """
+    if noise_px <= _MUCH_NOISE_PX:
+        return
+    size = _log_sizes(detections)
+    known, best = np.flatnonzero(np.isfinite(size)), list[tuple[float, int, float]]()
+    for k in range(_LEAST_RESIZED, known.size - _LEAST_RESIZED):
+        before, after = size[known[:k]], size[known[k:]]
+        change = float(after.mean() - before.mean())
+        spread = float(np.sqrt(before.var() / before.size + after.var() / after.size))
+        factor = min(FACTORS, key=lambda factor: abs(np.log(factor) - change))
+        best.append((abs(change) / max(spread, 1e-9), k, factor))
+    for _, k, factor in sorted(best, reverse=True)[:_ONSETS]:
+        one_size = detections.resized(int(known[k]), 1.0 / factor)
+        geometry: ImageGeometry | None = None
+        with suppress(WorkFailed):
+            alone, rng = len(detections.pair) == 1, np.random.default_rng(0)
+            geometry = RigidBody.of(one_size, frame) if alone else Epipolar.of(one_size, rng)
+        if geometry is not None and geometry.sigma_px < _ONE_SIZE * noise_px:
+            fits = [
+                np.bincount(of.pose_of, geometry.within(of, OUTLIER), len(of.q))
+                for of in (detections, detections.resized(0, 1.0 / factor))
+            ]
+            later = np.cumsum((fits[1] - fits[0])[::-1])[::-1]
+            onset = int(np.argmax(later))
+            subject = Subject(poses=(int(detections.pose[onset]),))
+            raise failed([Finding("image_size_changed", REFUSES, subject, factor, unit="1")])
+
+
+def _log_sizes(detections: Detections) -> FloatArray:
+    """Logarithm (K,) of distance from the corner and extent of what images show; NaN if unseen."""
+    pixels = detections.dense() + 0.5
+    seen = np.isfinite(pixels[..., 0])
+    count = np.where(seen.sum(axis=2) > 1, seen.sum(axis=2), np.nan)
+    pixels = np.where(seen[..., None], pixels, 0.0)
+    middle = pixels.sum(axis=2) / count[..., None]
+    square = (np.square(pixels - middle[:, :, None]).sum(axis=-1) * seen).sum(axis=2) / count
+    with np.errstate(invalid="ignore", divide="ignore"):
+        sizes = np.log(np.linalg.norm(middle, axis=-1)) + np.log(np.sqrt(square))
+        known = np.isfinite(sizes)
+        return np.asarray(0.5 * np.where(known, sizes, 0.0).sum(axis=0) / known.sum(axis=0))
 
 
 def _require_one_rig(detections: Detections) -> None:

@@ -1,24 +1,20 @@
-"""Refusals of a fit, and the cause that the data show: joints, order of images, poses that changed."""
+"""Refusals of a fit, and the causes that its residuals show: joints, poses that changed."""
 
-import dataclasses
 from collections.abc import Sequence
-from itertools import islice
-from typing import Any
 
 import numpy as np
 
-from projservo_cli.calibration.bundle_adjustment import LeastSquares, minimize
+from projservo_cli.calibration.bundle_adjustment import LeastSquares
 from projservo_cli.calibration.checks.model_error import stepped
 from projservo_cli.calibration.checks.outliers import MAX_OF_POSE, Outliers, fits_other_joints
 from projservo_cli.calibration.checks.quality import check_model
 from projservo_cli.calibration.checks.validation import cross_validate
-from projservo_cli.calibration.detections import Detections, beginning_in
+from projservo_cli.calibration.detections import beginning_in
 from projservo_cli.calibration.epipolar import ImageGeometry
-from projservo_cli.calibration.initialization import Search, starting_markers, starts
 from projservo_cli.calibration.lens_estimation import undistorted
-from projservo_cli.calibration.robust_fit import Expected, Solution, fit_from
+from projservo_cli.calibration.robust_fit import Expected, Solution
 from projservo_cli.findings import REFUSES, Finding, Subject
-from projservo_cli.records import TOOL, WORLD, BoolArray, FloatArray, WorkFailed, letters_of
+from projservo_cli.records import BoolArray
 
 # Maximum fitted over expected noise of a fit that rejects much, as wrong detections hide in the residuals.
 DOUBTED_RATIO = 1.15
@@ -35,14 +31,6 @@ _MIN_OF_POSE = 0.25
 _AGREEING = 5
 # Share of the poses that show another motion above which the joint readings are wrong.
 _MANY_POSES = 0.4
-# Number of hypotheses about a joint at fault that are fitted completely.
-_FOLLOWED = 2
-# Number of hypotheses about the mount and the order of images, the first ones.
-_ORDERS = 3
-# Number of adjustment steps of the screws by which hypotheses are compared before.
-_SCREW_STEPS = 8
-# Log residual added to a joint of the other type, which explains more: one that stands still is simpler.
-_SIMPLER = 0.1
 # Maximum number of markers in the test of joint types.
 _TYPED = 20
 # Minimum share of the readings by which a prismatic joint does not turn the images, and in deviations of it.
@@ -130,79 +118,6 @@ def straight_joints(solution: Solution) -> list[int]:
     gear, std = -inverse @ left[:, 0], solution.sigma_px * np.linalg.norm(inverse, axis=1)
     found = ~problem.detections.prismatic & (gear < -_STRAIGHT) & (gear < -_SURE * std)
     return [int(i) for i in np.flatnonzero(found)]
-
-
-def joint_at_fault(search: Search, max_px: float, straight: Sequence[int] | None = None) -> Finding | None:
-    """Find the one change, of a joint or of the order of images, with which the model fits.
-
-    A rough fit compares all changes. The best are fitted completely and accepted only if the fit passes as a
-    calibration does, with a noise of at most ``max_px``.
-
-    straight : joints that alone may be of the other type.
-    """
-    detections = search.problem.detections
-    few = detections.of_markers(starting_markers(detections, search.epipolar, search.rng))
-    changes = _hypotheses(few, search.problem.q_reference)
-    if straight is not None:
-        changes = [changes[_ORDERS + i] for i in straight]
-    candidates = []
-    try:
-        for done, (cause, changed, handicap) in enumerate(changes):
-            search.progress("calibration, joint at fault", done, len(changes))
-            seen = changed.detections.seen
-            for start in islice(starts(dataclasses.replace(search, problem=changed), changed.detections), 1):
-                params = minimize(
-                    changed, start, seen, robust=True, cameras=False, max_steps=_SCREW_STEPS
-                ).params
-                # In logarithms neither a few gross errors nor many small ones outweigh the rest.
-                level = np.mean(np.log(np.linalg.norm(changed.residual(params)[seen], axis=1) + 1e-9))
-                candidates.append((float(level) + handicap, cause, changed, params))
-    except WorkFailed:
-        return None
-    candidates.sort(key=lambda candidate: candidate[0])
-    for _, cause, changed, params in candidates[:_FOLLOWED]:
-        found = fit_from(changed, params, search.epipolar)
-        if found is None or found.sigma_px > max_px:
-            continue
-        if unexplained(found, Outliers.empty(changed.detections), search.epipolar) is None:
-            return cause
-    return None
-
-
-def _hypotheses(detections: Detections, q_reference: FloatArray) -> list[tuple[Finding, LeastSquares, float]]:
-    """Hypotheses that a joint is of the other type or stands still, or of late images; with a penalty."""
-    found = list[tuple[Finding, LeastSquares, float]]()
-    q, numbers = detections.q, detections.numbers
-
-    def add(
-        code: str, subject: Subject, unit: str = "", q_0: FloatArray = q_reference, **changed: Any
-    ) -> None:
-        """Add a hypothesis, which changes fields of the detections."""
-        problem = LeastSquares.of(dataclasses.replace(detections, **changed), q_0)
-        finding = Finding(code, REFUSES, subject, unit=unit)
-        found.append((finding, problem, _SIMPLER if code == "joint_type" else 0.0))
-
-    backwards: dict[str, Any] = {
-        "q": np.ascontiguousarray(-q[:, ::-1]),
-        "prismatic": detections.prismatic[::-1],
-    }
-    other = TOOL if detections.mount == WORLD else WORLD
-    add("other_mount", Subject(name=other), q_0=-q_reference[::-1], mount=other, **backwards)
-    add("images_before_readings", Subject(), q=np.vstack([q[:1], q[:-1]]))
-    add("images_after_readings", Subject(), q=np.vstack([q[1:], q[-1:]]))
-    for i, slides in enumerate(detections.prismatic):
-        flipped = detections.prismatic.copy()
-        flipped[i] = not slides
-        subject = Subject(joints=(int(numbers[i]),), name=letters_of(flipped[numbers.argsort()]))
-        add("joint_type", subject, "rad" if slides else "m", prismatic=flipped)
-    for i in range(len(q_reference) if len(q_reference) > 1 else 0):
-        fewer: dict[str, Any] = {
-            "q": np.delete(q, i, axis=1),
-            "prismatic": np.delete(detections.prismatic, i),
-        }
-        subject = Subject(joints=(int(numbers[i]),))
-        add("standing_joint", subject, q_0=np.delete(q_reference, i), **fewer)
-    return found
 
 
 def deviation(solution: Solution, expected: Expected) -> Finding | None:

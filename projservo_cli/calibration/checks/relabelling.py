@@ -1,0 +1,217 @@
+"""Relabellings of data: each takes a row for what it is not, and the model may fit with it.
+
+A row says which discrete thing is as given and may not be: where the cameras are, the order of joints and of
+images, the type of a joint, a joint that stands still or turns with another, its unit, the size of images
+from a pose on. All are tried in one way, before a deviation from the model absorbs them: a rough fit compares
+them, and the best are fitted completely.
+"""
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+from itertools import combinations, islice, permutations
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from projservo_cli.calibration.bundle_adjustment import LeastSquares, minimize
+from projservo_cli.calibration.checks.outliers import Outliers
+from projservo_cli.calibration.checks.refusal import unexplained
+from projservo_cli.calibration.detections import Detections
+from projservo_cli.calibration.initialization import Search, starting_markers, starts
+from projservo_cli.calibration.robust_fit import fit_from
+from projservo_cli.findings import REFUSES, Finding, Subject
+from projservo_cli.records import TOOL, WORLD, FloatArray, WorkFailed, letters_of
+
+# Number of relabellings of a kind that are fitted completely, and minimum share of detections that fit them.
+_FOLLOWED, _KEPT = 2, 0.6
+# Number of adjustment steps of the screws by which they are compared before.
+_SCREW_STEPS = 8
+# Log residual added to a joint of the other type, which explains more: one that stands still is simpler.
+_SIMPLER = 0.1
+# Readings, rad, that are degrees if they range over more, or may be if they range over less.
+_TURN, _HARDLY = 2.0 * np.pi, 0.2
+
+
+class Relabelling(NamedTuple):
+    """One thing that is not as given, and the data as they then are."""
+
+    finding: Finding
+    detections: Detections
+    q_reference: FloatArray  # (n,) rad or m
+    noise_px: float = np.nan  # that a complete fit leaves
+
+    @property
+    def problem(self) -> LeastSquares:
+        """Problem of the data as they then are."""
+        return LeastSquares.of(self.detections, self.q_reference)
+
+
+class _Data(NamedTuple):
+    """Data as given."""
+
+    detections: Detections
+    q_reference: FloatArray
+
+    def with_(
+        self, code: str, subject: Subject, unit: str = "", amount: float = np.nan, **changed: Any
+    ) -> Relabelling:
+        """Return the relabelling by a finding of a code, which changes fields of the detections."""
+        q_0 = changed.pop("q_0", self.q_reference)
+        finding = Finding(code, REFUSES, subject, amount, unit=unit)
+        return Relabelling(finding, dataclasses.replace(self.detections, **changed), q_0)
+
+    def of_joint(self, *joints: int, name: str = "") -> Subject:
+        """Return joints, by their columns, as the subject of a finding."""
+        return Subject(joints=tuple(int(self.detections.numbers[i]) for i in joints), name=name)
+
+
+def _mounts(data: _Data) -> Iterator[Relabelling]:
+    """Cameras on the tool that are given as fixed, or the other way round."""
+    d = data.detections
+    other, q = TOOL if d.mount == WORLD else WORLD, np.ascontiguousarray(-d.q[:, ::-1])
+    q_0 = -data.q_reference[::-1]
+    yield data.with_(
+        "other_mount", Subject(name=other), q_0=q_0, mount=other, q=q, prismatic=d.prismatic[::-1]
+    )
+
+
+def _orders_of_images(data: _Data) -> Iterator[Relabelling]:
+    """Images that come one pose late or early, against their readings."""
+    q = data.detections.q
+    yield data.with_("images_before_readings", Subject(), q=np.vstack([q[:1], q[:-1]]))
+    yield data.with_("images_after_readings", Subject(), q=np.vstack([q[1:], q[-1:]]))
+
+
+def _types(data: _Data) -> Iterator[Relabelling]:
+    """A joint of the other type."""
+    d = data.detections
+    for i, slides in enumerate(d.prismatic):
+        flipped = d.prismatic.copy()
+        flipped[i] = not slides
+        subject = data.of_joint(i, name=letters_of(flipped[d.numbers.argsort()]))
+        yield data.with_("joint_type", subject, "rad" if slides else "m", prismatic=flipped)
+
+
+def _standing(data: _Data) -> Iterator[Relabelling]:
+    """A joint that stands still while its readings move."""
+    d = data.detections
+    for i in range(d.prismatic.size if d.prismatic.size > 1 else 0):
+        fewer: dict[str, Any] = {"q": np.delete(d.q, i, axis=1), "prismatic": np.delete(d.prismatic, i)}
+        yield data.with_("standing_joint", data.of_joint(i), q_0=np.delete(data.q_reference, i), **fewer)
+
+
+def _exchanged(data: _Data) -> Iterator[Relabelling]:
+    """Two joints of one type of which each has the readings of the other."""
+    d = data.detections
+    for i, j in combinations(range(d.prismatic.size), 2):
+        if d.prismatic[i] == d.prismatic[j]:
+            order = np.arange(d.prismatic.size)
+            order[[i, j]] = j, i
+            q_0 = data.q_reference[order]
+            yield data.with_("exchanged_joints", data.of_joint(i, j), q=d.q[:, order], q_0=q_0)
+
+
+def _couplings(data: _Data) -> Iterator[Relabelling]:
+    """A joint that another one beside it turns as far as itself: a parallelogram, or a belt."""
+    d = data.detections
+    for read, moved in permutations(range(d.prismatic.size), 2):
+        if abs(read - moved) > 1 or d.prismatic[[read, moved]].any():
+            continue
+        for share in (-1.0, 1.0):
+            q, q_0 = d.q.copy(), data.q_reference.copy()
+            q[:, moved] += share * q[:, read]
+            q_0[moved] += share * q_0[read]
+            yield data.with_("full_coupling", data.of_joint(read, moved), "1", share, q=q, q_0=q_0)
+
+
+def _parallelograms(data: _Data) -> Iterator[Relabelling]:
+    """A joint whose link keeps its direction as the one before turns, and a hand that stays level with it.
+
+    The hand turns against the link, by a joint that has no reading.
+    """
+    d = data.detections
+    for i in range(d.prismatic.size - 1):
+        if d.prismatic[[i, i + 1]].any():
+            continue
+        for sense in (1.0, -1.0):
+
+            def linked(q: FloatArray, i: int = i, sense: float = sense) -> FloatArray:
+                """Readings (…, n + 1) with the joint without one, from those given."""
+                link, before = sense * q[..., i + 1], q[..., i]
+                q = np.insert(q, i + 2, -link, axis=-1)
+                q[..., i + 1] = link - before
+                return q
+
+            prismatic = np.insert(d.prismatic, i + 2, values=False)
+            changed = {"q": linked(d.q), "q_0": linked(data.q_reference), "prismatic": prismatic}
+            yield data.with_("full_coupling", data.of_joint(i, i + 1), "1", -1.0, **changed)
+
+
+def _units(data: _Data) -> Iterator[Relabelling]:
+    """A joint that is read in degrees where rad are given, or in rad where degrees are."""
+    d = data.detections
+    for i in np.flatnonzero(~d.prismatic).tolist():
+        span = float(np.ptp(d.q[:, i]))
+        if _HARDLY < span < _TURN:
+            continue
+        q, q_0, factor = (
+            d.q.copy(),
+            data.q_reference.copy(),
+            np.radians(1.0) if span > _TURN else np.degrees(1.0),
+        )
+        q[:, i], q_0[i] = factor * q[:, i], factor * q_0[i]
+        name = "degrees" if span > _TURN else "rad"
+        yield data.with_("joint_unit", data.of_joint(i, name=name), q=q, q_0=q_0)
+
+
+# All relabellings by which the same images may fit: the simple ones first, then those by which more would.
+SIMPLE = (_mounts, _orders_of_images, _types, _standing)
+OTHERS = (_exchanged, _couplings, _parallelograms, _units)
+
+
+def relabelled(search: Search, max_px: float, straight: Sequence[int] | None = None) -> Relabelling | None:
+    """Find the one thing that is not as given with which the model fits.
+
+    A rough fit compares all of a kind. The best are fitted completely and accepted only if the fit passes as
+    a calibration does, with a noise of at most ``max_px``.
+
+    straight : joints that alone may be of the other type.
+    """
+    detections = search.problem.detections
+    few = detections.of_markers(starting_markers(detections, search.epipolar, search.rng))
+    data = _Data(few, search.problem.q_reference)
+    if straight is not None:
+        types = list(_types(data))
+        return _best(search, max_px, [types[i] for i in straight])
+    for kinds in (SIMPLE, OTHERS):
+        found = _best(search, max_px, [one for kind in kinds for one in kind(data)])
+        if found is not None:
+            return found
+    return None
+
+
+def _best(search: Search, max_px: float, tried: Sequence[Relabelling]) -> Relabelling | None:
+    """Return the best of some relabellings by which the model fits, and the noise that it leaves, or None."""
+    candidates = []
+    try:
+        for done, one in enumerate(tried):
+            search.progress("calibration, other readings", done, len(tried))
+            problem, seen = one.problem, one.detections.seen
+            for start in islice(starts(dataclasses.replace(search, problem=problem), one.detections), 1):
+                params = minimize(
+                    problem, start, seen, robust=True, cameras=False, max_steps=_SCREW_STEPS
+                ).params
+                # In logarithms neither a few gross errors nor many small ones outweigh the rest.
+                level = np.mean(np.log(np.linalg.norm(problem.residual(params)[seen], axis=1) + 1e-9))
+                simpler = _SIMPLER if one.finding.code == "joint_type" else 0.0
+                candidates.append((float(level) + simpler, one, problem, params))
+    except WorkFailed:
+        return None
+    candidates.sort(key=lambda candidate: candidate[0])
+    for _, one, problem, params in candidates[:_FOLLOWED]:
+        found = fit_from(problem, params, search.epipolar)
+        if found is None or found.sigma_px > max_px or found.used.sum() < _KEPT * one.detections.seen.sum():
+            continue
+        if unexplained(found, Outliers.empty(one.detections), search.epipolar) is None:
+            return one._replace(noise_px=found.sigma_px)
+    return None
