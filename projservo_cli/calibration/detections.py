@@ -59,7 +59,7 @@ _ELONGATED = 10.0
 # Share of observations, assumed wrong, that may move more than the rest while the robot stands still.
 _MAX_WRONG = 0.1
 # A view stands still whose images move less than this share of those of another one, and less than that, px.
-_STILL_SHARE, _STILL_PX = 0.03, 3.0
+STILL_SHARE, STILL_PX = 0.03, 3.0
 # Minimum share of a beginning, or an end, of the poses that is nearly all of it.
 _NEARLY_ALL = 0.9
 # Probability that noise alone puts the markers of an image farther off their best line.
@@ -488,7 +488,7 @@ def _require_all_moving(detections: Detections) -> None:
     """Refuse a view that stands still while another moves: the fit would name the joints or the other."""
     moved = [_farthest(detections.of_views([v])) for v in range(len(detections.view))]
     still, most = int(np.argmin(moved)), int(np.argmax(moved))
-    if np.isfinite(moved[most]) and moved[still] < min(_STILL_SHARE * moved[most], _STILL_PX):
+    if np.isfinite(moved[most]) and moved[still] < min(STILL_SHARE * moved[most], STILL_PX):
         raise WorkFailed(
             f"the {detections.view[still]} images stand still within {moved[still]:.3g} px, while the "
             f"{detections.view[most]} ones move by {moved[most]:.3g} px: look whether that camera hangs, and "

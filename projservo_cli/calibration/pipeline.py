@@ -32,6 +32,7 @@ from projservo_cli.calibration.checks.refusal import (
     unexplained,
 )
 from projservo_cli.calibration.checks.relabelling import relabelled
+from projservo_cli.calibration.checks.strange_markers import standing, standing_markers, without_strange
 from projservo_cli.calibration.detections import (
     Detections,
     require_images,
@@ -188,6 +189,9 @@ def calibrate(
     # The matrices are small: a second thread costs more than it gives.
     with threadpool_limits(limits=1):
         whole = Detections.of(observation, joint_types, mount)
+        still = standing(whole)
+        of_still = [standing_markers(whole, still)] if still.any() else []
+        whole = whole.of_markers(~still)
         require_motion(whole)
         require_no_copies(whole)
         require_poses(whole)
@@ -214,6 +218,7 @@ def calibrate(
             limit = MAX_PREDICTED * float(frame.size.max()) if max_predicted_px is None else max_predicted_px
             asked = lens, init, curves
             solution, expected, result = _maximum_likelihood(search, whole, frame, expect, asked, limit)
+        result = with_findings(result, of_still) if still.any() else result
         seconds = time.perf_counter() - begin
         if solution is not None and fitted is not None:
             fitted(solution, expected.noise_px(solution))
@@ -315,6 +320,10 @@ def _refined(
     """Record of the maximum-likelihood solution in its projective frame, with its covariance."""
     share = share_explained(whole, frame)
     solution, kept = whole.determined()
+    numbers = solution.problem.detections.marker
+    solution, strange = without_strange(solution, epipolar.noise_px)
+    fitting = kept.copy()
+    kept[kept] = np.isin(numbers, solution.problem.detections.marker)
     detections = whole.problem.detections
     of_lens = Finding("unmodelled_lens", LIMITS, amount=share, unit="1")
     try:
@@ -346,10 +355,12 @@ def _refined(
         if hint is None:
             raise
         raise Misfit.by([*refused.findings, hint], detections) from None
-    more = [*_of_lens(record, frame.known)]
+    more = [*_of_lens(record, frame.known), *strange]
     if kept.all():
         return with_findings(record, more)
-    more.append(Finding("seldom_fitting", LIMITS, Subject(markers=tuple(detections.marker[~kept].tolist()))))
+    if not fitting.all():
+        seldom = tuple(detections.marker[~fitting].tolist())
+        more.append(Finding("seldom_fitting", LIMITS, Subject(markers=seldom)))
     outlier = np.concatenate(
         [record.outlier, outlier_rows(detections, detections.seen & ~kept[detections.marker_of])]
     )

@@ -168,9 +168,9 @@ class Solution:
         )
         if keep.all():
             return self, keep
-        return self._of_markers(keep), keep
+        return self.of_markers(keep), keep
 
-    def _of_markers(self, keep: BoolArray) -> "Solution":
+    def of_markers(self, keep: BoolArray) -> "Solution":
         """Select markers (m,)."""
         rows = keep[self.problem.detections.marker_of]
         smaller, params = _of_markers(self.problem, self.params, keep)
@@ -182,7 +182,7 @@ class Solution:
         """Select at most ``max_markers`` markers, evenly."""
         m = self.problem.detections.marker.size
         return (
-            self if m <= max_markers else self._of_markers(np.isin(np.arange(m), even_choice(m, max_markers)))
+            self if m <= max_markers else self.of_markers(np.isin(np.arange(m), even_choice(m, max_markers)))
         )
 
     def kept(self) -> "Solution":

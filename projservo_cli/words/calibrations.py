@@ -218,6 +218,26 @@ CALIBRATION = {
         "record again at one resolution, or remove the poses before or after",
         limit="images of two sizes",
     ),
+    "standing_markers": Row(
+        "{numbered} {stand} still while the others move: left out",
+        "remove what is not on the tool",
+        limit="markers that stand still",
+    ),
+    "marker_on_link": Row(
+        "{joints} {do} not move {numbered}, as if it sat before: left out",
+        "remove it, or put it on the tool",
+        limit="a marker on another body",
+    ),
+    "marker_drift": Row(
+        "{numbered} creeps by {amount} in the images over the recording: left out",
+        "glue it, and record again",
+        limit="a marker that creeps",
+    ),
+    "marker_step": Row(
+        "{numbered} moved at pose {poses} by {amount} in the images: left out",
+        "glue it, and record again",
+        limit="a marker that moved",
+    ),
     "standing_joint": Row(
         "by the images {joints} stands still while its readings move",
         "check that they are its own",
