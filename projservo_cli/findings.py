@@ -18,7 +18,7 @@ NOTE, LIMITS, REFUSES = "note", "limits", "refuses"
 # Codes of deviations of an arm or a rig from the model.
 DEVIATIONS = (
     *("scale", "quadratic", "cubic", "harmonic", "coupling", "sag", "joint_drift", "joint_step"),
-    *("camera_drift", "camera_step", "base", "tool", "lens", "lens_center", "focus"),
+    *("camera_drift", "camera_step", "base", "tool", "lens", "lens_center", "focus", "cyclic", "memory"),
 )
 
 
@@ -132,4 +132,4 @@ def _parsed(word: str, units: Sequence[str]) -> Finding:
     which = tuple(int(joint) for joint in joints.split(",") if joint)
     of_joint = units[which[-1] - 1] if which else "px"
     subject = Subject(joints=which, views=(view,) if view else ())
-    return Finding(code, LIMITS, subject, unit="1" if code in ("scale", "coupling") else of_joint)
+    return Finding(code, LIMITS, subject, unit="1" if code in ("scale", "coupling", "memory") else of_joint)

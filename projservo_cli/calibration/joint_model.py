@@ -8,6 +8,7 @@ poses best, if by more than chance, and stops where none does.
 """
 
 import dataclasses
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
@@ -56,6 +57,8 @@ _SURE = 2.0
 _AS_MUCH = 0.95
 # Maximum numbers of hypotheses that are chosen, and of those that are tried for each.
 _MAX_CHOSEN, _TRIED = 6, 4
+# Number of the likeliest hypotheses among which a kind that several joints have may be one of all.
+_NAMED = 12
 # Maximum deviation, rad (prismatic × 0.3 m/rad), of a joint within its range by a term that is determined.
 _OPEN = np.radians(5.0)
 # Deviations from zero below which a term of one joint of many is left out: H. Akaike's criterion of 1974, by
@@ -215,6 +218,12 @@ def describe_curve(calibration: Calibration) -> list[dict[str, Any]]:
     return found
 
 
+def _in_all(named: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """Return kinds in all joints, the most frequent first, of those that are named for several joints."""
+    kinds = Counter(one.kind for one in named if len(one.joints) == 1)
+    return [Hypothesis(kind, ()) for kind, count in kinds.most_common() if count > 1]
+
+
 class _Search:
     """Fits with curves, from one without."""
 
@@ -282,7 +291,8 @@ class _Search:
                 found += [] if solution.problem.detections.mount == TOOL else [Hypothesis("sag", ())]
             elif kind in _FUNCTIONS:
                 found.append(Hypothesis(kind, () if kind == "scale" and len(joints) > 1 else joints))
-        return list(dict.fromkeys(found))
+        found = list(dict.fromkeys(found))
+        return [*_in_all(found[:_NAMED]), *found]
 
     def pruned(self, found: Solution, chosen: Sequence[Hypothesis]) -> Solution:
         """Fit without terms of hypotheses of all joints that differ from zero by chance, or bend too far."""

@@ -51,6 +51,16 @@ OF_MODEL = {
     "lens_center": Row(
         "the {view} lens is decentred, by {size}", "calibrate with --lens", limit="lens of the {view} camera"
     ),
+    "cyclic": Row(
+        "readings of {joints} err by {size} again and again, every {limit}",
+        "look at its screw or gear; its errors between poses are stated",
+        limit="cyclic errors of {joints}",
+    ),
+    "memory": Row(
+        "images keep {size} of those before",
+        "switch the filter of the tracker off, or let each pose settle for longer",
+        limit="a tracker that lags",
+    ),
     "focus": Row(
         "the {view} image is scaled with depth, by {size}",
         "fix the focus, switch autofocus off, and record again",

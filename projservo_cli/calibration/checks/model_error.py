@@ -81,10 +81,14 @@ _SIZES: dict[str, float] = {
     "lens": 2.0,
     "lens_center": 2.0,
     "focus": 1.0,
+    "cyclic": float(np.radians(0.2)),
+    "memory": 0.03,
 }
 # Kinds whose amplitude is a motion of the images.
 _OF_IMAGES = ("camera_drift", "camera_step", "base", "tool", "lens", "lens_center", "focus")
-_NO_TIME, _DRIFT, _STEP = range(3)
+_NO_TIME, _DRIFT, _STEP, _PAST = range(4)
+# Cycles over the range of a joint that are tried, and maximum number for each of its readings that differ.
+_CYCLES, _SHOWN = np.arange(2.0, 16.1, 0.5), 0.25
 
 
 class _Nuisance(NamedTuple):
@@ -94,8 +98,9 @@ class _Nuisance(NamedTuple):
     joints: tuple[int, ...]  # from 0
     view: int | None
     columns: FloatArray  # (V, N, 2, d) weighted, by its amplitudes
-    timed: int = _NO_TIME  # whether it drifts or steps over the order of poses
+    timed: int = _NO_TIME  # whether it drifts or steps over the order of poses, or is of the image before
     tag: int | None = None  # of a single tag
+    period: float = np.nan  # rad or m, the best of those tried
 
     @property
     def like(self) -> tuple[str, int, int, bool]:
@@ -116,10 +121,11 @@ class _Extent(NamedTuple):
     center: FloatArray  # (V, 2) of the images, px
     radius: FloatArray  # (V,) half the size of the images, px
     depth: FloatArray  # (V, 2) mean and deviation of depths
+    cycles: FloatArray  # (n,) over the range of each joint that explain most; NaN where too few are shown
 
     @classmethod
     def of(cls, solution: Solution) -> "_Extent":
-        """Return the ranges of the detections that count."""
+        """Return the ranges of the detections that count, and how often residuals swing over them."""
         problem, detections, used = solution.problem, solution.problem.detections, solution.used
         q, depths = problem.q[np.unique(detections.pose_of)], problem.pixels(solution.params)[1]
         low, high = (
@@ -130,7 +136,35 @@ class _Extent(NamedTuple):
         half = np.maximum(0.5 * np.ptp(q, axis=0), 1e-9)
         middle = 0.5 * (q.min(axis=0) + q.max(axis=0))
         radius = np.maximum(0.5 * (high - low).max(axis=1), 1.0)  # of a view of which one detection is left
-        return cls(middle, half, 0.5 * (low + high), radius, depth)
+        x = (problem.q - middle) / half
+        return cls(middle, half, 0.5 * (low + high), radius, depth, _cycles(solution, x))
+
+
+def _cycles(solution: Solution, x: FloatArray) -> FloatArray:
+    """Cycles (n,) over the range of each joint, x (K, n) from −1 to 1, that explain most of the residuals.
+
+    Joint by joint, at each pose by the error of the reading that explains its residuals best.
+    """
+    problem = solution.problem
+    G = problem.joint_derivative(solution.params) * solution.used[..., None, None]
+    weight = problem.at_poses(np.square(G).sum(axis=(0, 2)))  # (K, n)
+    score = -problem.at_poses((G * solution.raw[..., None]).sum(axis=(0, 2)))
+    found = np.full(x.shape[1], np.nan)
+    for i, angle in enumerate(np.pi * x.T):
+        readings = np.unique(np.round(problem.q[:, i] / SAME_READING)).size
+        gains = []
+        root = np.sqrt(weight[:, i])
+        y = score[:, i] / np.maximum(root, 1e-300)
+        plain = np.stack([np.ones_like(angle), angle]) * root
+        Q = np.linalg.qr(plain.T)[0]
+        y = y - Q @ (Q.T @ y)
+        for cycles in _CYCLES[_SHOWN * readings >= _CYCLES]:
+            waves = (np.stack([np.sin(cycles * angle), np.cos(cycles * angle)]) * root).T
+            waves -= Q @ (Q.T @ waves)
+            gains.append(float(y @ waves @ np.linalg.lstsq(waves, y)[0]))
+        if gains:
+            found[i] = _CYCLES[int(np.argmax(gains))]
+    return found
 
 
 def _nuisances(problem: LeastSquares, params: Parameters, extent: _Extent) -> list[_Nuisance]:
@@ -140,6 +174,10 @@ def _nuisances(problem: LeastSquares, params: Parameters, extent: _Extent) -> li
     found = _of_readings(problem, params, q, extent, images)
     for v in range(len(params.P)):
         found += _of_view(problem, params, extent, images, v)
+    before = replace(detections, pose_of=np.maximum(detections.pose_of - 1, 0))
+    change = replace(problem, detections=before).pixels(params)[0] - images.pixels
+    columns = (change * detections.weight[..., None])[..., None]
+    found.append(_Nuisance("memory", (), None, columns, _PAST))
     center = params.M[:, :3].mean(axis=0)
     rigid = np.zeros((6, 4, 4))
     rigid[:3, :3, :3], rigid[3:, :3, 3] = cross_matrix(np.eye(3)), np.eye(3)
@@ -166,10 +204,12 @@ def _of_readings(
     G = images.by_joint(params.H_hat) * detections.weight[..., None, None]
     x, unit, loads = (q - extent.middle) / extent.half, per_rad(params.prismatic), _loads(params, q)
 
-    def of_joint(kind: str, i: int, change: FloatArray, *others: int, timed: int = _NO_TIME) -> None:
+    def of_joint(
+        kind: str, i: int, change: FloatArray, *others: int, timed: int = _NO_TIME, period: float = np.nan
+    ) -> None:
         """Add a nuisance that changes readings of joint i by (K, d)."""
         columns = G[..., [i]] * change[detections.pose_of][:, None]
-        found.append(_Nuisance(kind, (*others, i), None, columns, timed))
+        found.append(_Nuisance(kind, (*others, i), None, columns, timed, period=period))
 
     for i in range(n):
         of_joint("scale", i, q[:, [i]])
@@ -179,6 +219,9 @@ def _of_readings(
         if not params.prismatic[i]:
             of_joint("harmonic", i, np.stack([np.sin(q[:, i]), np.cos(q[:, i])], axis=1))
             of_joint("sag", i, loads[:, i])
+        if np.isfinite(cycles := extent.cycles[i]):
+            waves = np.stack([np.sin(np.pi * cycles * x[:, i]), np.cos(np.pi * cycles * x[:, i])], axis=1)
+            of_joint("cyclic", i, unit[i] * waves, period=2.0 * extent.half[i] / cycles)
         for j in range(n):
             if j != i:
                 of_joint("coupling", i, q[:, [j]] * unit[i] / unit[j], j)
@@ -292,7 +335,7 @@ class _Tests:
         """Columns (L, d) of a nuisance in units of its usual size."""
         own = self.Z[:, slice(*self.parts[choice.number : choice.number + 2])]
         timed = self.nuisances[choice.number].timed
-        if timed == _NO_TIME:
+        if timed in (_NO_TIME, _PAST):
             return own
         return own * np.repeat(_over_time(timed, len(self.poses), choice.onset), np.diff(self.edges))[:, None]
 
@@ -333,7 +376,7 @@ class _Tests:
             """Keep a nuisance whose gain in squares is worth its amplitudes and the choice of it."""
             one, d = self.nuisances[choice.number], len(self.units[choice.number])
             likelihood = -self.dof * np.log1p(-min(gain / max(square, 1e-300), 1.0 - 1e-12))
-            tries = alike[one.like] * onsets
+            tries = alike[one.like] * onsets * (len(_CYCLES) if one.kind == "cyclic" else 1)
             criterion = d * (1.0 + np.log(max(likelihood / d, 1.0))) + 2.0 * np.log(tries) - likelihood
             if criterion < 0.0:
                 found.append((float(criterion), choice, gain))
@@ -640,7 +683,8 @@ class _Effects:
         """Changes (rows, d) at the end of the recording by a nuisance of columns (L, d) in the data."""
         one = self.there[number]
         columns = one.columns.reshape(len(self.rows), -1)[self.rows] @ self.tests.units[number]
-        return np.asarray((0.5 if one.timed == _DRIFT else 1.0) * columns - self.T @ (self.tests.U.T @ Z))
+        share = {_DRIFT: 0.5, _PAST: 0.0}.get(one.timed, 1.0)  # at rest, images are of nothing before
+        return np.asarray(share * columns - self.T @ (self.tests.U.T @ Z))
 
     def rms(self, change: FloatArray) -> float:
         """Root mean square per marker and view of a change (rows,)."""
@@ -697,7 +741,7 @@ def _finding(
         poses=() if first is None else (first,),
     )
     sizes = factor * size, factor * deviation
-    return Finding(one.kind, LIMITS, subject, *sizes, unit=unit, effect_px=effect)
+    return Finding(one.kind, LIMITS, subject, *sizes, limit=one.period, unit=unit, effect_px=effect)
 
 
 def _design(tests: _Tests, r: FloatArray, T: FloatArray, sigma_px: float) -> float:
