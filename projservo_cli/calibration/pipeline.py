@@ -319,12 +319,11 @@ def _refined(
 ) -> Calibration:
     """Record of the maximum-likelihood solution in its projective frame, with its covariance."""
     share = share_explained(whole, frame)
-    solution, kept = whole.determined()
-    numbers = solution.problem.detections.marker
-    solution, strange = without_strange(solution, epipolar.noise_px)
-    fitting = kept.copy()
-    kept[kept] = np.isin(numbers, solution.problem.detections.marker)
     detections = whole.problem.detections
+    some, strange = without_strange(whole, epipolar.noise_px)
+    solution, fitting = some.determined()
+    seldom = tuple(some.problem.detections.marker[~fitting].tolist())
+    kept = np.isin(detections.marker, solution.problem.detections.marker)
     of_lens = Finding("unmodelled_lens", LIMITS, amount=share, unit="1")
     try:
         if (why := refusal(solution, expected)) is not None:
@@ -358,8 +357,7 @@ def _refined(
     more = [*_of_lens(record, frame.known), *strange]
     if kept.all():
         return with_findings(record, more)
-    if not fitting.all():
-        seldom = tuple(detections.marker[~fitting].tolist())
+    if seldom:
         more.append(Finding("seldom_fitting", LIMITS, Subject(markers=seldom)))
     outlier = np.concatenate(
         [record.outlier, outlier_rows(detections, detections.seen & ~kept[detections.marker_of])]

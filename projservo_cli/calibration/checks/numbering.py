@@ -109,16 +109,8 @@ def _require_one_size(detections: Detections, frame: ImageFrame, noise_px: float
     """
     if noise_px <= _MUCH_NOISE_PX:
         return
-    size = _log_sizes(detections)
-    known, best = np.flatnonzero(np.isfinite(size)), list[tuple[float, int, float]]()
-    for k in range(_LEAST_RESIZED, known.size - _LEAST_RESIZED):
-        before, after = size[known[:k]], size[known[k:]]
-        change = float(after.mean() - before.mean())
-        spread = float(np.sqrt(before.var() / before.size + after.var() / after.size))
-        factor = min(FACTORS, key=lambda factor: abs(np.log(factor) - change))
-        best.append((abs(change) / max(spread, 1e-9), k, factor))
-    for _, k, factor in sorted(best, reverse=True)[:_ONSETS]:
-        one_size = detections.resized(int(known[k]), 1.0 / factor)
+    for onset, factor in size_changes(detections)[:_ONSETS]:
+        one_size = detections.resized(onset, 1.0 / factor)
         geometry: ImageGeometry | None = None
         with suppress(WorkFailed):
             alone, rng = len(detections.pair) == 1, np.random.default_rng(0)
@@ -129,9 +121,21 @@ def _require_one_size(detections: Detections, frame: ImageFrame, noise_px: float
                 for of in (detections, detections.resized(0, 1.0 / factor))
             ]
             later = np.cumsum((fits[1] - fits[0])[::-1])[::-1]
-            onset = int(np.argmax(later))
-            subject = Subject(poses=(int(detections.pose[onset]),))
+            subject = Subject(poses=(int(detections.pose[np.argmax(later)]),))
             raise failed([Finding("image_size_changed", REFUSES, subject, factor, unit="1")])
+
+
+def size_changes(detections: Detections) -> list[tuple[int, float]]:
+    """Rows of poses from which images may be larger, and by which factor, the clearest change first."""
+    size = _log_sizes(detections)
+    known, found = np.flatnonzero(np.isfinite(size)), list[tuple[float, int, float]]()
+    for k in range(_LEAST_RESIZED, known.size - _LEAST_RESIZED):
+        before, after = size[known[:k]], size[known[k:]]
+        change = float(after.mean() - before.mean())
+        spread = float(np.sqrt(before.var() / before.size + after.var() / after.size))
+        factor = min(FACTORS, key=lambda factor: abs(np.log(factor) - change))
+        found.append((abs(change) / max(spread, 1e-9), int(known[k]), factor))
+    return [(onset, factor) for _, onset, factor in sorted(found, reverse=True)]
 
 
 def _log_sizes(detections: Detections) -> FloatArray:

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from projservo_cli.calibration.bundle_adjustment import LeastSquares, minimize
+from projservo_cli.calibration.checks.numbering import size_changes
 from projservo_cli.calibration.checks.outliers import Outliers
 from projservo_cli.calibration.checks.refusal import unexplained
 from projservo_cli.calibration.detections import Detections
@@ -164,9 +165,17 @@ def _units(data: _Data) -> Iterator[Relabelling]:
         yield data.with_("joint_unit", data.of_joint(i, name=name), q=q, q_0=q_0)
 
 
+def _sizes(data: _Data) -> Iterator[Relabelling]:
+    """Images of another size from the pose on at which their extent changes most."""
+    d = data.detections
+    for onset, factor in size_changes(d)[:1]:
+        pixels, subject = d.resized(onset, 1.0 / factor).pixels, Subject(poses=(int(d.pose[onset]),))
+        yield data.with_("image_size_changed", subject, "1", factor, pixels=pixels)
+
+
 # All relabellings by which the same images may fit: the simple ones first, then those by which more would.
 SIMPLE = (_mounts, _orders_of_images, _types, _standing)
-OTHERS = (_exchanged, _couplings, _parallelograms, _units)
+OTHERS = (_exchanged, _couplings, _parallelograms, _units, _sizes)
 
 
 def relabelled(search: Search, max_px: float, straight: Sequence[int] | None = None) -> Relabelling | None:

@@ -5,6 +5,7 @@ motion of its own explains its images. Each such motion is exact or to first ord
 """
 
 from collections.abc import Iterator
+from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -81,6 +82,7 @@ def _strange(solution: Solution) -> Iterator[tuple[int, _Motion]]:
     problem, detections = solution.problem.with_noise(None), solution.problem.detections
     m = detections.marker.size
     squares = np.where(detections.seen, np.square(problem.residual(solution.params)).sum(axis=2), 0.0)
+    squares = np.nan_to_num(squares, nan=np.inf)
     count = np.maximum(detections.count_of(detections.seen), 1)
     level = np.bincount(detections.marker_of, squares.sum(axis=0), m) / (2.0 * count)
     usual = max(float(np.median(level)), solution.sigma_px**2, 1e-300)
@@ -111,20 +113,27 @@ class _Track:
 
     def _placed(self, motion: FloatArray) -> tuple[float, FloatArray, FloatArray]:
         """Place the marker by motions (N, 4, 4): squared residuals, residuals (L,) and derivative (L, 3)."""
-        found, M, best = self.detections, self.params.M[self.j].copy(), np.inf
+        own = self.params.M[self.j]
+        best = np.inf, np.zeros(0), np.zeros((0, 3))
+        for start in (own, np.nanmean(np.delete(self.params.M, self.j, axis=0), axis=0)):
+            best = min(best, self._from(start, motion), key=itemgetter(0))
+        return best
+
+    def _from(self, M: FloatArray, motion: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+        """Least squares from a place (4,), by steps of Gauss and Newton, until one leads no more down."""
+        found, best = self.detections, (np.inf, np.zeros(0), np.zeros((0, 3)))
         weight = (found.weight * found.seen)[..., None]
-        for _ in range(_STEPS):
-            points = motion @ M
-            pixels, G, _ = projection_derivative(self.params.P, self.params.lens, points)
+        for _ in range(_STEPS if np.isfinite(M).all() else 0):
+            pixels, G, _ = projection_derivative(self.params.P, self.params.lens, motion @ M)
             r = ((pixels - found.pixels) * weight).ravel()
             by_point = (G @ self.params.P[:, None]) @ motion
             J = (by_point[..., :3] * weight[..., None]).reshape(-1, 3)
             square = float(r @ r)
-            if not np.isfinite(square) or square >= best * (1.0 - 1e-6):
+            if not np.isfinite(square) or square >= best[0] * (1.0 - 1e-6):
                 break
-            best, kept = square, (r, J)
-            M[:3] -= np.linalg.lstsq(J, r)[0]
-        return (best, *kept) if np.isfinite(best) else (best, np.zeros(0), np.zeros((0, 3)))
+            best = square, r, J
+            M = M - np.append(np.linalg.lstsq(J, r)[0], 0.0)
+        return best
 
     def motions(self) -> Iterator[_Motion]:
         """Yield motions of its own: with a link, or standing; creeping; slipped at a pose."""

@@ -1,0 +1,130 @@
+"""Rows that are not what they seem: each is named by its code and subject, or left out, and no other is."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from projservo_cli.calibration import calibrate, predict
+from projservo_cli.records import WorkFailed
+from tests.calibration.simulated_robot import around, random_robot, trials
+
+TYPES, SIGMA = "RRRR", 0.3
+
+
+def recorded(seed, types=TYPES, markers=10, count=30):
+    """A random arm, readings of trials and combined poses, and the generator of its noise."""
+    rng = np.random.default_rng(seed)
+    robot = random_robot(types, rng, markers=markers)
+    return robot, np.concatenate([trials(robot, frames=4), around(robot, count, rng, angle=0.6)]), rng
+
+
+def refused(observation, types=TYPES):
+    """The first finding on what a table is refused for."""
+    with pytest.raises(WorkFailed) as caught:
+        calibrate(observation, types, source="recorded")
+    return caught.value.findings[0]
+
+
+@pytest.mark.parametrize("pair", [(0, 1), (1, 3)])
+def test_joints_in_the_place_of_each_other_are_named(pair):
+    robot, q, rng = recorded(1)
+    order = np.arange(4)
+    order[[*pair]] = pair[::-1]
+    one = refused(dataclasses.replace(robot.observe(q, SIGMA, rng), q=q[:, order]))
+    assert (one.code, one.subject.joints) == ("exchanged_joints", tuple(i + 1 for i in pair))
+
+
+def test_a_joint_that_keeps_the_direction_of_its_link_is_a_parallelogram():
+    robot, q, rng = recorded(2)
+    linked = q.copy()
+    linked[:, 2] -= q[:, 1] - robot.q_reference[1]
+    one = refused(dataclasses.replace(robot.observe(linked, SIGMA, rng), q=q))
+    assert (one.code, one.subject.joints, one.amount) == ("full_coupling", (2, 3), -1.0)
+
+
+def test_a_joint_in_degrees_is_named():
+    robot, q, rng = recorded(3)
+    given = q.copy()
+    given[:, 1] = np.degrees(q[:, 1])
+    one = refused(dataclasses.replace(robot.observe(q, SIGMA, rng), q=given))
+    assert (one.code, one.subject.joints, one.subject.name) == ("joint_unit", (2,), "degrees")
+
+
+@pytest.mark.parametrize(("factor", "views"), [(0.5, 2), (2.0, 2), (0.5, 1)])
+def test_images_of_another_size_are_named_by_their_first_pose(factor, views):
+    robot, q, rng = recorded(4)
+    seen = robot.observe(q, SIGMA, rng)
+    images = seen.images[:, :views].copy()
+    images[20:] = factor * (images[20:] + 0.5) - 0.5
+    one = refused(dataclasses.replace(seen, images=images, view=seen.view[:views]))
+    assert (one.code, one.amount) == ("image_size_changed", factor)
+    assert abs(one.subject.poses[0] - seen.pose[20]) <= 2  # numbers of poses are two apart
+
+
+def with_marker(robot, j, images_of):
+    """Images of an arm of which one marker moves otherwise."""
+    images = robot.images
+    return lambda q: np.where((np.arange(10) == j)[:, None], images_of(q), images(q))
+
+
+def creeping(robot, q):
+    """Images of a marker that creeps on the tool by 2 % of its distance from the others."""
+    at = robot.M if hasattr(robot, "M") else robot.markers
+    size = 0.3 * np.ptp(at[:, :3], axis=0).max()
+    by = np.linspace(0.0, size, len(q))
+    rows = []
+    for k, shift in enumerate(by):
+        there = at.copy()
+        there[3, :3] += shift
+        moved = dataclasses.replace(robot, **{"M" if hasattr(robot, "M") else "markers": there})
+        rows.append(moved.images(q[k : k + 1])[0])
+    return np.array(rows)
+
+
+def on_a_link(robot, q):
+    """Images of a marker that does not move with the last joint."""
+    still = q.copy()
+    still[:, -1] = robot.q_reference[-1]
+    return robot.images(still)
+
+
+def standing(robot, q):
+    """Images of a marker that stays where it is at first."""
+    return np.broadcast_to(robot.images(q[:1]), robot.images(q).shape)
+
+
+OWN = {
+    "marker_drift": (creeping, ()),
+    "marker_on_link": (on_a_link, (4,)),
+    "standing_markers": (standing, ()),
+}
+
+
+@pytest.mark.parametrize("code", OWN)
+def test_a_marker_that_moves_in_its_own_way_is_named_and_left_out(code):
+    images_of, joints = OWN[code]
+    robot, q, rng = recorded(5)
+    seen = robot.observe(q, SIGMA, rng)
+    images = seen.images.copy()
+    noise = images[:, :, 3] - robot.images(q)[:, :, 3]
+    images[:, :, 3] = images_of(robot, q)[:, :, 3] + noise
+    found = calibrate(dataclasses.replace(seen, images=images), TYPES, source="recorded")
+    named = [one for one in found.findings if one.subject.markers]
+    assert [(one.code, one.subject.joints) for one in named] == [(code, joints)]
+    number = int(seen.marker[3])
+    assert named[0].subject.markers == (number,)
+    assert found.usable
+    assert number not in found.marker
+    truth = robot.images(around(robot, 20, rng, angle=0.6))
+    assert truth.shape[2] == 10
+
+
+def test_sound_tables_blame_no_row():
+    for seed in range(3):
+        robot, q, rng = recorded(seed)
+        found = calibrate(robot.observe(q, SIGMA, rng), TYPES, source="recorded", joint_noise=None)
+        assert found.usable
+        assert not any(one.subject.joints or one.subject.markers for one in found.findings)
+        off = predict(found, q) - robot.images(q)
+        assert np.sqrt(np.mean((off**2).sum(axis=-1))) < 2.0 * found.predicted_rms_px
