@@ -59,7 +59,7 @@ def other_order(arm, q, ahead, rng):
     i = int(rng.choice([i for i in range(len(types) - 1) if types[i] == types[i + 1]]))
     order = [*range(len(types))]
     order[i], order[i + 1] = i + 1, i
-    one = plain(arm, q, ahead, rng, ("joint_order", "other_order"))
+    one = plain(arm, q, ahead, rng, ("exchanged_joints",))
     return one._replace(q=q[:, order], ahead=ahead[:, order], joints=(i + 1, i + 2))
 
 
@@ -76,8 +76,8 @@ def parallelogram(arm, q, ahead, rng):
 
 
 def half_size(arm, q, ahead, rng):
-    """Images of another size from a pose on; the first size is that of the calibration."""
-    onset, factor = int(rng.integers(len(q) // 4, 3 * len(q) // 4)), float(rng.choice([0.5, 2.0, 0.75]))
+    """Images that are smaller from a pose on: larger ones are beyond the size that is given."""
+    onset, factor = int(rng.integers(len(q) // 4, 3 * len(q) // 4)), float(rng.choice([0.5, 2.0 / 3.0, 0.75]))
     one = plain(arm, q, ahead, rng, ("image_size_changed",), poses=(onset,))
     one.s[onset:] = factor * (one.s[onset:] + 0.5) - 0.5
     return one
@@ -199,6 +199,7 @@ FAULTS = {
     "marker creeps": creeps,
     "tracker remembers": remembers,
     "cyclic": cyclic,
+    "cyclic, random": cyclic,
     "servo curve": servo_curve,
     "other pose": other_pose,
     "late from a pose": late_from_a_pose,
@@ -235,7 +236,7 @@ def judged(job):
     arm, number = ARMS[job.arm], [*FAULTS].index(job.fault)
     rng = np.random.default_rng([SEED, [*ARMS].index(job.arm), job.seed, number])
     # Trials of each joint, then some of several at once: all that a usual recording has.
-    q = poses_of(arm, "trials", rng)
+    q = poses_of(arm, "random" if job.fault.endswith("random") else "trials", rng)
     ahead = rng.uniform(q.min(axis=0), q.max(axis=0), (HELD_OUT, len(arm.home)))
     table = FAULTS[job.fault](arm, q.copy(), ahead.copy(), rng)
     s = table.s + NOISE_PX * rng.standard_normal(table.s.shape)

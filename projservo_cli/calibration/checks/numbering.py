@@ -35,7 +35,7 @@ _OF_FEW = 15.0
 _MISFIT, _LEAST_MOVED = 0.5, 5
 # Minimum number of poses before and after images change their size, number of onsets that are tried, and
 # noise of images of one size over that as they are.
-_LEAST_RESIZED, _ONSETS, _ONE_SIZE = 4, 5, 0.3
+_LEAST_RESIZED, _ONSETS, _ONE_SIZE = 4, 3, 0.5
 # Maximum number of tags whose own geometry is tried.
 _MAX_TAGS = 6
 # Corners of a tag, numbered 4 t to 4 t + 3.
@@ -126,15 +126,23 @@ def _require_one_size(detections: Detections, frame: ImageFrame, noise_px: float
 
 
 def size_changes(detections: Detections) -> list[tuple[int, float]]:
-    """Rows of poses from which images may be larger, and by which factor, the clearest change first."""
+    """Rows of poses from which images may be larger, and by which factor, the clearest change first.
+
+    Sizes change with the joints too, by a polynomial of the second order or, of few poses, of the first.
+    """
     size = _log_sizes(detections)
     known, found = np.flatnonzero(np.isfinite(size)), list[tuple[float, int, float]]()
+    q = detections.q[known]
+    x = (q - q.mean(axis=0)) / np.maximum(np.ptp(q, axis=0), 1e-9)
+    by_joints = np.hstack([np.ones((known.size, 1)), x, x**2][: 3 if known.size > 6 * x.shape[1] else 2])
+    Q = np.linalg.qr(by_joints)[0]
+    left = size[known] - Q @ (Q.T @ size[known])
     for k in range(_LEAST_RESIZED, known.size - _LEAST_RESIZED):
-        before, after = size[known[:k]], size[known[k:]]
-        change = float(after.mean() - before.mean())
-        spread = float(np.sqrt(before.var() / before.size + after.var() / after.size))
+        step = (np.arange(known.size) >= k).astype(np.float64)
+        step -= Q @ (Q.T @ step)
+        change = float(step @ left / max(step @ step, 1e-9))
         factor = min(FACTORS, key=lambda factor: abs(np.log(factor) - change))
-        found.append((abs(change) / max(spread, 1e-9), int(known[k]), factor))
+        found.append((change**2 * float(step @ step), int(known[k]), factor))
     return [(onset, factor) for _, onset, factor in sorted(found, reverse=True)]
 
 

@@ -24,7 +24,7 @@ from projservo_cli.findings import REFUSES, Finding, Subject
 from projservo_cli.records import TOOL, WORLD, FloatArray, WorkFailed, letters_of
 
 # Number of relabellings of a kind that are fitted completely, and minimum share of detections that fit them.
-_FOLLOWED, _KEPT = 2, 0.6
+_FOLLOWED, _KEPT = 2, 0.8
 # Number of adjustment steps of the screws by which they are compared before.
 _SCREW_STEPS = 8
 # Log residual added to a joint of the other type, which explains more: one that stands still is simpler.
