@@ -21,7 +21,7 @@ COUNTED = Finding(
 def finding(code, joint_unit):
     """A finding with all that its words may name."""
     unit = {"scale": "1", "coupling": "1"}.get(code, joint_unit if "joint" in code else "px")
-    joints = (3, 2) if "coupling" in code else (2,)
+    joints = (3, 2) if "coupling" in code or code == "level_hand" else (2,)
     name = "singular" if code.startswith("replanned") else "arm.json"
     subject = Subject(joints, ("left", "right"), (5, 6), 3, (7, 9), name)
     return Finding(code, LIMITS, subject, 0.02, 0.001, 0.5, unit, 1.5, (COUNTED, COUNTED, COUNTED))

@@ -215,8 +215,14 @@ CALIBRATION = {
     ),
     "full_coupling": Row(
         "by the images joint {of[0]} turns joint {of[1]} by {full}, as a parallelogram or a belt does",
-        "fit that: --joint-model coupling:{of[0]}-{of[1]}",
+        "calibrate with --joint-model coupling:{of[0]}-{of[1]}",
         limit="a coupling of joints",
+    ),
+    "level_hand": Row(
+        "by the images joint {of[0]} turns joint {of[1]} by {full}, a parallelogram, and a joint without a "
+        "reading keeps the hand level",
+        "calibrate an arm of which all joints read: no joint model has such a hand",
+        limit="a parallelogram",
     ),
     "joint_unit": Row(
         "by the images readings of {joints} are {name}",

@@ -145,7 +145,7 @@ def _parallelograms(data: _Data) -> Iterator[Relabelling]:
 
             prismatic = np.insert(d.prismatic, i + 2, values=False)
             changed = {"q": linked(d.q), "q_0": linked(data.q_reference), "prismatic": prismatic}
-            yield data.with_("full_coupling", data.of_joint(i, i + 1), "1", -1.0, **changed)
+            yield data.with_("level_hand", data.of_joint(i, i + 1), "1", -1.0, **changed)
 
 
 def _units(data: _Data) -> Iterator[Relabelling]:
