@@ -46,6 +46,7 @@ class Finding:
     limit: float = math.nan  # that the amount is held against
     unit: str = ""  # px, rad, m, s, or 1 for a share or a count
     effect_px: float = math.nan  # rms error of predicted images by it, per marker and view
+    period: float = math.nan  # of an error that repeats over a joint, rad or m
     others: tuple["Finding", ...] = ()  # that the data do not tell from it, or that it consists of
 
     def plain(self) -> dict[str, Any]:

@@ -24,7 +24,7 @@ def finding(code, joint_unit):
     joints = (3, 2) if "coupling" in code or code == "level_hand" else (2,)
     name = "singular" if code.startswith("replanned") else "arm.json"
     subject = Subject(joints, ("left", "right"), (5, 6), 3, (7, 9), name)
-    return Finding(code, LIMITS, subject, 0.02, 0.001, 0.5, unit, 1.5, (COUNTED, COUNTED, COUNTED))
+    return Finding(code, LIMITS, subject, 0.02, 0.001, 0.5, unit, 1.5, 0.2, (COUNTED, COUNTED, COUNTED))
 
 
 @pytest.mark.parametrize("code", words.ROWS)

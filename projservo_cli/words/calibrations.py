@@ -52,7 +52,7 @@ OF_MODEL = {
         "the {view} lens is decentred, by {size}", "calibrate with --lens", limit="lens of the {view} camera"
     ),
     "cyclic": Row(
-        "readings of {joints} err by {size} again and again, every {limit}",
+        "readings of {joints} err by {size} again and again, every {period}",
         "look at its screw or gear; its errors between poses are stated",
         limit="cyclic errors of {joints}",
     ),

@@ -402,6 +402,7 @@ VALUES: dict[str, Callable[[Told], object]] = {
     "times_as": lambda told: "half" if told.one.amount == 0.5 else f"{told.one.amount:.3g} times",
     "stand": lambda told: "stands" if len(told.subject.markers) == 1 else "stand",
     "do": lambda told: "does" if told.single else "do",
+    "period": lambda told: quantity(told.one.period, told.one.unit),
     "number_of_last": lambda told: f"{told.one.others[-1].amount:g}",
     "postures": lambda told: (
         f"postures of joints {told.joints[0]} to {told.joints[-1]}" if told.joints else "poses"

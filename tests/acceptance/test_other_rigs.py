@@ -135,7 +135,8 @@ def test_case_38_joint_named_for_a_camera_on_the_tool(case, answer):
     for one in found["findings"]:
         if joints := one["subject"].get("joints"):
             assert one["unit"] == ("m" if max(joints) <= 3 else "rad")
-    assert "off by 90 mm" in error
+    (one,) = (one for one in found["findings"] if 2 in one["subject"].get("joints", ()))
+    assert 0.05 < one["amount"] < 0.2
     assert "on the tool" not in error
 
 

@@ -160,4 +160,4 @@ def test_a_cyclic_error_is_named_by_its_period_and_stated():
     one = next(one for one in found.findings if one.code == "cyclic")
     assert one.subject.joints == (2,)
     assert one.amount == pytest.approx(np.radians(0.3), rel=0.4)
-    assert one.limit == pytest.approx(0.2, rel=0.1)
+    assert one.period == pytest.approx(0.2, rel=0.1)

@@ -230,13 +230,15 @@ def judged(job):
         row |= {f"{name}_68": np.mean(z < 1.0), f"{name}_95": np.mean(z < 1.96)}
     causes, verdicts = sorted(getattr(found, "model_errors", ()), key=lambda one: -abs(one.effect_px)), [""]
     for one in causes:
-        both = {"left", "right"} <= {other.view for other in causes if other.kind == one.kind}
-        what = one.kind, tuple(one.joints), "" if both else one.view
+        alike = [other.subject.views for other in causes if other.code == one.code]
+        both = {("left",), ("right",)} <= {*alike}
+        what = one.code, one.subject.joints, "" if both else "".join(one.subject.views)
         said = any(all(a in (None, b) for a, b in zip(some, what, strict=True)) for some in right)
         same = said or (put is not None and setting.same_images(put_in, what))
         verdicts.append("right" if said else "equivalent" if same else "wrong")
     words = (
-        f"{c.kind} {c.joints} {c.view} {c.estimate:.3g} ± {c.deviation:.2g}, {c.effect_px:.3g} px"
+        f"{c.code} {c.subject.joints} {''.join(c.subject.views)} {c.amount:.3g} ± {c.deviation:.2g}, "
+        f"{c.effect_px:.3g} px"
         for c in causes
     )
     judgement = {"judged": verdicts[min(1, len(causes))], "others_wrong": verdicts[2:].count("wrong")}

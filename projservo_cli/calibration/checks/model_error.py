@@ -330,6 +330,7 @@ class _Tests:
             Z[:, own] @= self.units[-1]
         self.Z = Z
         self.Q = np.zeros((len(r), 0))  # orthonormal columns of the nuisances chosen
+        self.periods = False  # whether what repeats over a joint is a candidate
 
     def columns(self, choice: _Choice) -> FloatArray:
         """Columns (L, d) of a nuisance in units of its usual size."""
@@ -366,7 +367,11 @@ class _Tests:
         """Return criterion, nuisance and gain of all that the criterion prefers to none, best first."""
         square, K = float(self.r @ self.r), len(self.poses)
         alike = Counter(one.like for one in self.nuisances)
-        plain = [number for number, one in enumerate(self.nuisances) if one.timed != _STEP]
+        plain = [
+            number
+            for number, one in enumerate(self.nuisances)
+            if one.timed != _STEP and (self.periods or one.kind != "cyclic")
+        ]
         stack = np.hstack([self.columns(_Choice(number, 0)) for number in plain])
         s, W = stack.T @ self.r, np.vstack([self.U.T @ stack, self.Q.T @ stack])
         edges = np.cumsum([0, *(self.units[number].shape[0] for number in plain)])
@@ -430,11 +435,17 @@ class _Tests:
         return tries * max(chance, float(fdtrc(d, freedom, wald)))
 
     def select(self) -> list[_Choice]:
-        """Choose nuisances one by one, then exchange each for a better one in the presence of the others."""
+        """Choose nuisances one by one, then exchange each for a better one in the presence of the others.
+
+        Waves over a joint mimic much, so they are candidates where nothing else is found.
+        """
         chosen = list[_Choice]()
-        while len(chosen) < _MAX_FOUND and (best := self._best()) is not None:
-            chosen.append(best)
-            self.choose(chosen)
+        for self.periods in (False, True):
+            while len(chosen) < _MAX_FOUND and (best := self._best()) is not None:
+                chosen.append(best)
+                self.choose(chosen)
+            if chosen:
+                break
         for _ in range(_ROUNDS if chosen else 0):
             before = list(chosen)
             for one in before:
@@ -741,7 +752,7 @@ def _finding(
         poses=() if first is None else (first,),
     )
     sizes = factor * size, factor * deviation
-    return Finding(one.kind, LIMITS, subject, *sizes, limit=one.period, unit=unit, effect_px=effect)
+    return Finding(one.kind, LIMITS, subject, *sizes, unit=unit, effect_px=effect, period=one.period)
 
 
 def _design(tests: _Tests, r: FloatArray, T: FloatArray, sigma_px: float) -> float:

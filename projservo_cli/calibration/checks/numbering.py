@@ -36,6 +36,8 @@ _MISFIT, _LEAST_MOVED = 0.5, 5
 # Minimum number of poses before and after images change their size, number of onsets that are tried, and
 # noise of images of one size over that as they are.
 _LEAST_RESIZED, _ONSETS, _ONE_SIZE = 4, 3, 0.5
+# Noise of images of one size over that of those before they changed, which counts as much again.
+_LIKE_FIRST = 1.5
 # Maximum number of tags whose own geometry is tried.
 _MAX_TAGS = 6
 # Corners of a tag, numbered 4 t to 4 t + 3.
@@ -111,11 +113,12 @@ def _require_one_size(detections: Detections, frame: ImageFrame, noise_px: float
         return
     for onset, factor in size_changes(detections)[:_ONSETS]:
         one_size = detections.resized(onset, 1.0 / factor)
-        geometry: ImageGeometry | None = None
-        with suppress(WorkFailed):
-            alone, rng = len(detections.pair) == 1, np.random.default_rng(0)
-            geometry = RigidBody.of(one_size, frame) if alone else Epipolar.of(one_size, rng)
-        if geometry is not None and geometry.sigma_px < _ONE_SIZE * noise_px:
+        before = detections.of_poses(np.arange(len(detections.q)) < onset)
+        first, geometry = (_geometry(some, frame) for some in (before, one_size))
+        if first is None or geometry is None:
+            continue
+        of_first_px = _LIKE_FIRST * max(1.0, 1.0 / factor) * first.noise_px
+        if geometry.sigma_px < min(_MUCH_NOISE_PX, _ONE_SIZE * noise_px, of_first_px):
             fits = [
                 np.bincount(of.pose_of, geometry.within(of, OUTLIER), len(of.q))
                 for of in (detections, detections.resized(0, 1.0 / factor))
@@ -123,6 +126,15 @@ def _require_one_size(detections: Detections, frame: ImageFrame, noise_px: float
             later = np.cumsum((fits[1] - fits[0])[::-1])[::-1]
             subject = Subject(poses=(int(detections.pose[np.argmax(later)]),))
             raise failed([Finding("image_size_changed", REFUSES, subject, factor, unit="1")])
+
+
+def _geometry(detections: Detections, frame: ImageFrame) -> ImageGeometry | None:
+    """Geometry of images, or None where they show none."""
+    with suppress(WorkFailed):
+        if len(detections.pair) == 1:
+            return RigidBody.of(detections, frame)
+        return Epipolar.of(detections, np.random.default_rng(0))
+    return None
 
 
 def size_changes(detections: Detections) -> list[tuple[int, float]]:
@@ -133,16 +145,17 @@ def size_changes(detections: Detections) -> list[tuple[int, float]]:
     size = _log_sizes(detections)
     known, found = np.flatnonzero(np.isfinite(size)), list[tuple[float, int, float]]()
     q = detections.q[known]
-    x = (q - q.mean(axis=0)) / np.maximum(np.ptp(q, axis=0), 1e-9)
+    x = (q - q.mean(axis=0)) / np.maximum(q.max(axis=0) - q.min(axis=0), 1e-9)
     by_joints = np.hstack([np.ones((known.size, 1)), x, x**2][: 3 if known.size > 6 * x.shape[1] else 2])
     Q = np.linalg.qr(by_joints)[0]
     left = size[known] - Q @ (Q.T @ size[known])
     for k in range(_LEAST_RESIZED, known.size - _LEAST_RESIZED):
         step = (np.arange(known.size) >= k).astype(np.float64)
         step -= Q @ (Q.T @ step)
-        change = float(step @ left / max(step @ step, 1e-9))
+        square = float(step @ step)
+        change = float(step @ left) / max(square, 1e-9)
         factor = min(FACTORS, key=lambda factor: abs(np.log(factor) - change))
-        found.append((change**2 * float(step @ step), int(known[k]), factor))
+        found.append((change**2 * square, int(known[k]), factor))
     return [(onset, factor) for _, onset, factor in sorted(found, reverse=True)]
 
 

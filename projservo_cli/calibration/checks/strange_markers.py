@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from projservo_cli.calibration.detections import STILL_PX, STILL_SHARE, Detections
+from projservo_cli.calibration.detections import MAX_JUDGED, STILL_PX, STILL_SHARE, Detections
 from projservo_cli.calibration.prediction import projection_derivative
 from projservo_cli.calibration.robust_fit import Solution, fit_inliers
 from projservo_cli.findings import LIMITS, Finding, Subject
@@ -38,7 +38,7 @@ def standing(detections: Detections) -> BoolArray:
     for v, j in zip(*np.nonzero(asked), strict=True):
         track = pixels[v, seen[v, :, j], j]
         spread[v, j] = np.median(np.linalg.norm(track - np.median(track, axis=0), axis=1))
-    if not asked.any(axis=1).all():
+    if detections.marker.size > MAX_JUDGED or not asked.any(axis=1).all():
         return np.zeros(detections.marker.size, dtype=np.bool_)
     most = np.array([np.max(of_view[np.isfinite(of_view)]) for of_view in spread])
     still = ~asked | ((spread < STILL_PX) & (spread < STILL_SHARE * most[:, None]))
@@ -66,6 +66,8 @@ def without_strange(solution: Solution, noise_px: float) -> tuple[Solution, tupl
     noise_px : of the rig.
     """
     detections = solution.problem.detections
+    if detections.marker.size > MAX_JUDGED:  # of many tracks a fit rejects those that drift
+        return solution, ()
     found = {j: motion.finding for j, motion in _strange(solution)}
     of_tag = np.bincount(detections.marker[[*found]] // CORNERS) if found else np.zeros(0)
     found = {j: one for j, one in found.items() if of_tag[detections.marker[j] // CORNERS] == 1}
