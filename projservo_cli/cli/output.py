@@ -152,8 +152,9 @@ def _of_calibration(value: dict[str, Any], detailed: bool) -> Iterator[str]:
         usable = value["usable"]
         yield wrapped(f"calibrate: {f'usable: {found}' if usable else 'NOT usable: ' + value['reason']}")
         limits = [one["text"] for one in value["findings"][:1] if usable and one["severity"] == "limits"]
+        refusing = [one["text"] for one in value["findings"] if one["severity"] == "refuses"]
         for text in limits + [text for text in value["advice"] if text not in value["notes"]]:
-            yield wrapped(f"limits: {text}", "  ")
+            yield wrapped(f"{'refused' if text in refusing else 'limits'}: {text}", "  ")
         if value["time_offset_s"] is not None:
             yield wrapped(f"time offset {', '.join(_time_offsets(value))}", "  ")
     where = " on the tool" if value["mount"] == "tool" else ""

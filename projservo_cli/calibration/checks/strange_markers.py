@@ -4,6 +4,7 @@ A few of them leave a fit of all others as it is, so each is asked by itself, wi
 motion of its own explains its images. Each such motion is exact or to first order of a small shift.
 """
 
+from collections import Counter
 from collections.abc import Iterator
 from operator import itemgetter
 from typing import NamedTuple
@@ -24,6 +25,8 @@ _IMAGES, _LEFT = 6, 3
 _OFF, _EXPLAINED = 4.0, 0.4
 # Gain in squared residuals for each number of a motion, over those of the others, from which it is named.
 _DECISIVE = 50.0
+# Motions that corners of a tag have together, and number of them from which it is one.
+_OF_TAGS, _OF_A_TAG = ("marker_drift", "marker_step"), 3
 # Steps by which a marker is placed, number of onsets that are tried, and share of the markers that may be so.
 _STEPS, _ONSETS, _SHARE = 8, 16, 1.0 / 3.0
 
@@ -69,8 +72,10 @@ def without_strange(solution: Solution, noise_px: float) -> tuple[Solution, tupl
     if detections.marker.size > MAX_JUDGED:  # of many tracks a fit rejects those that drift
         return solution, ()
     found = {j: motion.finding for j, motion in _strange(solution)}
-    of_tag = np.bincount(detections.marker[[*found]] // CORNERS) if found else np.zeros(0)
-    found = {j: one for j, one in found.items() if of_tag[detections.marker[j] // CORNERS] == 1}
+    # A tag that slips or creeps is found as one, by what is rejected of it.
+    moved = [detections.marker[j] // CORNERS for j, one in found.items() if one.code in _OF_TAGS]
+    tags = {tag for tag, count in Counter(moved).items() if count >= _OF_A_TAG}
+    found = {j: one for j, one in found.items() if detections.marker[j] // CORNERS not in tags}
     if not found or len(found) > _SHARE * detections.marker.size:
         return solution, ()
     keep = ~np.isin(np.arange(detections.marker.size), [*found])
