@@ -109,8 +109,10 @@ class JointNoise:
             return likelihood.deviance(at) - minimum - _INTERVAL
 
         low, high = 0.0, _MAX_SIGMA_Q
-        if none - minimum > _INTERVAL:
-            low = likelihood.sigma_q(brentq(beyond, log_ratios[0] - _FARTHER, log_ratio))
+        least = log_ratios[0] - _FARTHER
+        # Residuals of tens of px, as of images of two sizes, leave no noise of joints that is too small.
+        if none - minimum > _INTERVAL and beyond(least) > 0.0:
+            low = likelihood.sigma_q(brentq(beyond, least, log_ratio))
         if beyond(log_ratios[-1]) > 0.0:
             high = likelihood.sigma_q(brentq(beyond, log_ratio, log_ratios[-1]))
         if high >= _MAX_SIGMA_Q:  # a wrong model asks for any amount of noise
