@@ -218,7 +218,7 @@ def calibrate(
             limit = MAX_PREDICTED * float(frame.size.max()) if max_predicted_px is None else max_predicted_px
             asked = lens, init, curves
             solution, expected, result = _maximum_likelihood(search, whole, frame, expect, asked, limit)
-        result = with_findings(result, of_still) if still.any() else result
+        result = with_findings(result, of_still) if of_still else result
         seconds = time.perf_counter() - begin
         if solution is not None and fitted is not None:
             fitted(solution, expected.noise_px(solution))

@@ -389,8 +389,7 @@ VALUES: dict[str, Callable[[Told], object]] = {
     "sizes": lambda told: joined(
         f"{one.amount:.0f}x{one.limit:.0f} {one.subject.views[0]}" for one in told.one.others
     ),
-    "which": lambda told: f"marker{'s' * (len(told.subject.markers) > 1)} {told['each_number']}",
-    "each_number": lambda told: ", ".join(map(str, told.subject.markers)) or "none",
+    "which": lambda told: f"marker{'s' * (len(told.subject.markers) > 1)} {told['all_numbers'] or 'none'}",
     "needed": lambda told: _NEEDED.get(told.one.limit, ""),
     "freedom": lambda told: _FREEDOMS.get(told.one.amount, ""),
     "about": _about_line,

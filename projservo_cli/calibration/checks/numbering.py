@@ -95,13 +95,13 @@ def _require_one_pose(detections: Detections, noise_px: float) -> None:
         pairs = Observation(
             detections.pose[1:], detections.marker, detections.q[1:], np.stack(together, axis=1)
         )
-        shifted, shifted_px = Detections.of(pairs, "R" * detections.q.shape[1]), np.inf
-        with suppress(WorkFailed):
-            shifted_px = Epipolar.of(shifted, np.random.default_rng(0)).sigma_px
-        if shifted_px < limit_px:
+        shifted = _epipolar(Detections.of(pairs, "R" * detections.q.shape[1]))
+        if shifted is not None and shifted.sigma_px < limit_px:
             names = [detections.view[v] for v in detections.pair]
             subject = Subject(views=(names[late], names[1 - late]))
-            raise failed([Finding("late_view", REFUSES, subject, shifted_px, limit=limit_px, unit="px")])
+            raise failed(
+                [Finding("late_view", REFUSES, subject, shifted.sigma_px, limit=limit_px, unit="px")]
+            )
 
 
 def _require_one_size(detections: Detections, frame: ImageFrame, noise_px: float) -> None:
@@ -128,12 +128,19 @@ def _require_one_size(detections: Detections, frame: ImageFrame, noise_px: float
             raise failed([Finding("image_size_changed", REFUSES, subject, factor, unit="1")])
 
 
-def _geometry(detections: Detections, frame: ImageFrame) -> ImageGeometry | None:
-    """Geometry of images, or None where they show none."""
+def _epipolar(detections: Detections) -> Epipolar | None:
+    """Epipolar geometry of images, or None where they show none."""
     with suppress(WorkFailed):
-        if len(detections.pair) == 1:
-            return RigidBody.of(detections, frame)
         return Epipolar.of(detections, np.random.default_rng(0))
+    return None
+
+
+def _geometry(detections: Detections, frame: ImageFrame) -> ImageGeometry | None:
+    """Geometry of images of one view or two, or None where they show none."""
+    if len(detections.pair) > 1:
+        return _epipolar(detections)
+    with suppress(WorkFailed):
+        return RigidBody.of(detections, frame)
     return None
 
 
@@ -186,10 +193,8 @@ def _require_one_rig(detections: Detections) -> None:
 
 def _misfitting(detections: Detections, half: BoolArray) -> BoolArray:
     """Whether each pose (K,) misfits the geometry of some poses (K,); none where these show none."""
-    K = len(detections.q)
-    try:
-        geometry = Epipolar.of(detections.of_poses(half), np.random.default_rng(0))
-    except WorkFailed:
+    K, geometry = len(detections.q), _epipolar(detections.of_poses(half))
+    if geometry is None:
         return np.zeros(K, dtype=np.bool_)
     off = detections.both & ~geometry.within(detections, OUTLIER)
     count, wrong = (np.bincount(detections.pose_of[of], minlength=K) for of in (detections.both, off))
@@ -241,10 +246,9 @@ def _by_tags(detections: Detections) -> IntArray:
     parts += [detections.of_markers(np.isin(np.arange(len(index)), of)) for of in which[:_MAX_TAGS]]
     order = np.arange(len(index))
     for part in parts:
-        with suppress(WorkFailed):
-            geometry = Epipolar.of(part, np.random.default_rng(0))
-            if geometry.sigma_px < _MUCH_NOISE_PX:
-                order = _true_order(detections, geometry, _OF_FEW)
+        geometry = _epipolar(part)
+        if geometry is not None and geometry.sigma_px < _MUCH_NOISE_PX:
+            order = _true_order(detections, geometry, _OF_FEW)
         if (order != np.arange(order.size)).any():
             break
     return order
