@@ -47,6 +47,8 @@ KINDS: dict[str, tuple[str, float | None]] = {
     "subpix": ("subpix", None),
     "jpeg": ("jpeg", None),
 }
+# Corners "noise" err by so much in each frame anew, px a coordinate, and by nothing else.
+NOISE_PX = 0.5
 LAST: list["StandIn"] = []  # the one that was made last, for what a study asks of it
 
 
@@ -169,7 +171,7 @@ def seen(T, view, faults=()):
 class StandIn:
     """The arm with its cameras, of the contract.
 
-    arm : ``five`` or ``six`` joints. corners : one of ``KINDS``; "exact" has no errors.
+    arm : ``five`` or ``six`` joints. corners : one of ``KINDS``; "noise" has new errors alone, "exact" none.
     at_deg : (n,) where it stands at first; backlash_deg : from end to end of each joint; latency_s : of both
     cameras. frames : whether it has (empty) images. fault : what befalls it from ``at`` on, s; None nothing.
     """
@@ -299,6 +301,9 @@ class StandIn:
             rng = np.random.default_rng([self.seed, view, k + 2**20])
             pixels += errors + fresh[..., None] * rng.standard_normal(errors.shape)
             shown = shown & (share >= LEAST_FOUND)
+        elif self.kind == "noise":
+            rng = np.random.default_rng([self.seed, view, k + 2**20])
+            pixels += NOISE_PX * rng.standard_normal(pixels.shape)
         for fault in here:
             if fault["kind"] == "occlusion":
                 shown = shown & (np.arange(len(shown)) != fault["tag"])
