@@ -14,6 +14,7 @@ from projservo_cli.calibration.bundle_adjustment import LeastSquares
 from projservo_cli.calibration.checks.joint_order import require_poses
 from projservo_cli.calibration.checks.model_error import ModelCheck
 from projservo_cli.calibration.checks.numbering import checked_geometry
+from projservo_cli.calibration.checks.other_poses import on_shown_poses
 from projservo_cli.calibration.checks.outliers import (
     Outliers,
     moved_images,
@@ -287,7 +288,11 @@ def _maximum_likelihood(
         result = _refined(solution, epipolar, expected, frame, limit_px)
     except Misfit as refused:
         # The joints of a simulation are as configured, so none is at fault.
-        found = None if expected.known else relabelled(start, REFUSE_RATIO * expected.sigma_px)
+        last = (
+            one for one in refused.findings if one.code == "rejected_poses" and one.subject.name == "last"
+        )
+        onset = next((len(whole.q) - int(one.amount) for one in last), None)
+        found = None if expected.known else relabelled(start, REFUSE_RATIO * expected.sigma_px, onset=onset)
         if found is None:
             raise
         raise Misfit.by([found.finding, *refused.findings], whole) from None
@@ -351,7 +356,8 @@ def _refined(
                 )
     except Misfit as refused:
         hint = deviation(solution, expected) if share < _DECISIVE_SHARE else of_lens
-        if hint is None:
+        by_joints = refused.findings[0].code == "several_joints"  # then nothing else moved
+        if hint is None or (by_joints and not hint.subject.joints):
             raise
         raise Misfit.by([*refused.findings, hint], detections) from None
     more = [*_of_lens(record, frame.known), *strange]
@@ -418,7 +424,8 @@ def _record(
     counts = len(found.suspect) + len(found.poses), len(found.id_switches)
     verdict = assess(solution, errors, expected, outlier, counts, suspicion, limit_px)
     check, (about, *rest) = verdict.check, verdict.findings
-    findings = (about, *rest, *moved_images(detections, found.moved))
+    of_images = *moved_images(detections, found.moved), *on_shown_poses(detections, found.shown)
+    findings = (about, *rest, *of_images)
     if errors is None:
         m, unknown = len(params.M), np.full(params.P.size + params.H_hat.size, np.nan)
         off = Errors(unknown[:, None], np.full((m, 4, 1), np.nan), np.full((m, 4, 3), np.nan))

@@ -143,6 +143,11 @@ CALIBRATION = {
         "fix the camera",
         limit="motion of the {view} camera",
     ),
+    "other_pose": Row(
+        "the {view} camera shows {shown_poses} at pose {poses}: these images are rejected",
+        "take the newest frame of each camera once the arm stands",
+        limit="images of other poses",
+    ),
     "seldom_fitting": Row(
         "hardly any detection of marker {numbers} fits: rejected", "record it in more poses"
     ),
@@ -198,6 +203,16 @@ CALIBRATION = {
     "images_after_readings": Row(
         "each image shows the pose after its reading",
         "store readings with the image of the same pose, and take the newest frame",
+        limit="readings of other poses",
+    ),
+    "images_late_from": Row(
+        "from pose {poses} on each image shows the pose before its reading",
+        "pair images and readings by their times from there on, or remove these {count} poses",
+        limit="readings of other poses",
+    ),
+    "images_early_from": Row(
+        "from pose {poses} on each image shows the pose after its reading",
+        "pair images and readings by their times from there on, or remove these {count} poses",
         limit="readings of other poses",
     ),
     "other_mount": Row(
@@ -311,6 +326,12 @@ REFUSALS = {
         "or the readings of joints changed there",
         "record again, or remove these poses",
         limit="poses",
+    ),
+    "several_joints": Row(
+        "the fit rejects {count} of the {total} poses in which several joints move, and {rest} of the "
+        "{of_rest} others: no other order of joints explains them, so joints err by more than trials show",
+        "record poses in which all joints move (calibration.random_poses), which tell periodic errors",
+        limit="errors of joints",
     ),
     "joint_order": Row(
         "the fit rejects {count} of the {total} poses in which several joints move, and {rest} of the "

@@ -348,8 +348,8 @@ ROBOTS: dict[str, Row] = (
         unusable_calibration=("is not usable", "record and calibrate again"),
         uncompared=("was not compared: no marker of it is seen", "show the tags"),
         refuted=("{found}", "put that back, or record and calibrate again"),
-        refuted_camera=(
-            "{found}",
+        refit_poses=(
+            "the {view} camera alone is off",
             "put the {view} camera back, or fit it again from {of_poses} poses, after which it errs by "
             "{amount} ({limit} before it moved)",
         ),

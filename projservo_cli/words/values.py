@@ -324,6 +324,9 @@ VALUES: dict[str, Callable[[Told], object]] = {
     "numbers": lambda told: examples(told.subject.markers),
     "begin": lambda told: f" at pose {told.subject.poses[0]}" if told.subject.poses else "",
     "poses": lambda told: examples(told.subject.poses),
+    "shown_poses": lambda told: (
+        f"pose {examples(told.rest.subject.poses)}" if told.rest.subject.poses else "another pose"
+    ),
     "runs": lambda told: _runs(told.subject.poses),
     "s": lambda told: "s" if len(set(told.subject.poses)) > 1 else "",
     "there": lambda told: "on the tool" if told.subject.name == TOOL else "fixed",

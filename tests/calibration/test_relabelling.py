@@ -161,3 +161,48 @@ def test_a_cyclic_error_is_named_by_its_period_and_stated():
     assert one.subject.joints == (2,)
     assert one.amount == pytest.approx(np.radians(0.3), rel=0.4)
     assert one.period == pytest.approx(0.2, rel=0.1)
+
+
+@pytest.mark.parametrize(("step", "code"), [(-1, "images_late_from"), (1, "images_early_from")])
+def test_images_that_come_late_or_early_from_a_pose_on_are_named(step, code):
+    robot, q, rng = recorded(9)
+    seen, onset = robot.observe(q, SIGMA, rng), 25
+    images, last = seen.images.copy(), len(q) - max(step, 0)
+    images[onset:last] = seen.images[onset + step : last + step]
+    one = refused(dataclasses.replace(seen, images=images))
+    assert one.code == code
+    assert abs(one.subject.poses[0] - seen.pose[onset]) <= 2
+
+
+def test_images_of_another_pose_are_named_with_the_pose_that_they_show():
+    robot, q, rng = recorded(10)
+    seen, at = robot.observe(q, SIGMA, rng), np.array([15, 22, 31])
+    images = seen.images.copy()
+    images[at, 1] = seen.images[at - 4, 1] + SIGMA * rng.standard_normal(images[at, 1].shape)
+    found = calibrate(dataclasses.replace(seen, images=images), TYPES, source="recorded")
+    (one,) = (one for one in found.findings if one.code == "other_pose")
+    assert (one.subject.views, one.subject.poses) == (("right",), tuple(seen.pose[at]))
+    assert one.others[0].subject.poses == tuple(seen.pose[at - 4])
+    assert found.usable
+
+
+def test_a_camera_that_moved_far_and_came_back_is_named_by_its_poses():
+    robot, q, rng = recorded(11)
+    seen = robot.observe(q, SIGMA, rng)
+    images = seen.images.copy()
+    images[14:20, 0] += 60.0
+    found = calibrate(dataclasses.replace(seen, images=images), TYPES, source="recorded")
+    (one,) = (one for one in found.findings if one.code == "moved_camera")
+    assert (one.subject.views, one.subject.poses) == (("left",), (seen.pose[14], seen.pose[19]))
+    assert found.usable
+
+
+def test_joints_that_err_by_more_than_trials_show_are_not_in_another_order():
+    robot, q, rng = recorded(12, count=12)
+    away = q[:, 2] - robot.q_reference[2]
+    alone = np.unique(np.round(away[np.abs(q - robot.q_reference)[:, :2].max(axis=1) < 1e-9], 9))
+    wave = np.sin(np.pi * np.interp(away, alone, np.arange(alone.size)))  # nothing where it moves alone
+    seen = dataclasses.replace(
+        robot.observe(q + np.radians(5.0) * wave[:, None] * np.eye(3)[2], SIGMA, rng), q=q
+    )
+    assert refused(seen).code == "several_joints"

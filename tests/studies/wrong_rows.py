@@ -175,7 +175,7 @@ def camera_and_back(arm, q, ahead, rng):
     v, first = int(rng.integers(2)), int(rng.integers(len(q) // 4, len(q) // 2))
     last = first + len(q) // 5
     by = rng.uniform(-1.0, 1.0, 2)
-    one = plain(arm, q, ahead, rng, ("camera_away", "moved_images"), poses=(first,))
+    one = plain(arm, q, ahead, rng, ("moved_camera",), poses=(first,))
     one.s[first:last, v] += 8.0 * by / np.linalg.norm(by)
     return one._replace(views=(("left", "right")[v],))
 

@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 
 from projservo_cli.calibration.bundle_adjustment import LeastSquares, fit_offsets
 from projservo_cli.calibration.checks.model_error import image_motions
+from projservo_cli.calibration.checks.other_poses import shown_poses
 from projservo_cli.calibration.detections import RAYLEIGH, Detections
 from projservo_cli.calibration.epipolar import OUTLIER
 from projservo_cli.calibration.initialization import stationary
@@ -30,7 +31,7 @@ _SEEN = 3
 _MOSTLY = 0.5
 # Minimum number of detections of such an image: two more than its motion has coordinates, to test it.
 _SEEN_OF_IMAGE = 4
-# Maximum motion of such an image, over the spread of its markers.
+# Maximum motion of such an image, over the spread of its markers, where no other view shows the joints.
 _SMALL_MOTION = 0.1
 # Minimum number of poses over which a camera settles, and of later ones, whose shifts are by chance.
 _SETTLES, _LATER = 2, 10
@@ -46,21 +47,25 @@ class Outliers:
     id_switches: IntArray  # (W, 3) row of the pose, index of the marker as numbered and of the true one
     poses: IntArray  # (P,) rows of poses whose images show other joints than those read
     moved: IntArray  # (V, 2) row of the pose and view of images that a motion of the camera explains
+    shown: IntArray  # (P, 3) row of the pose, view, and row of the pose that its image shows instead
     explained: BoolArray  # (V, N) detections that these explain
 
     @classmethod
     def empty(cls, detections: Detections) -> "Outliers":
         """Return no explanations."""
         rows = np.zeros((0, 3), dtype=np.int64)
-        return cls(rows[:, :2], rows, rows[:, 0], rows[:, :2], np.zeros_like(detections.seen))
+        return cls(rows[:, :2], rows, rows[:, 0], rows[:, :2], rows, np.zeros_like(detections.seen))
 
     @classmethod
     def of(cls, solution: Solution) -> "Outliers":
-        """Explain rejected detections: exchanged marker numbers, moved cameras, then wrong joint readings."""
+        """Explain rejected detections: exchanged numbers, other poses, moved cameras, then wrong readings."""
         problem, params, used = solution.problem, solution.params, solution.used
         detections, sigma = problem.detections, solution.sigma_px
         out = detections.seen & ~used
         id_switches, explained = _id_switches(problem, params, out, OUTLIER * sigma)
+        shown = shown_poses(solution, out & ~explained)
+        for k, view, _ in shown:
+            explained[view] |= out[view] & (detections.pose_of == k)
         moved = _moved_images(solution, out & ~explained)
         for k, view in moved:
             here = detections.pose_of == k
@@ -80,14 +85,14 @@ class Outliers:
                 explained[:, here] |= out[:, here]
                 poses += [] if joints else [int(k)]
         pairs = np.array(suspects, dtype=np.int64).reshape(-1, 2)
-        return cls(pairs, id_switches, np.array(poses, dtype=np.int64), moved, explained)
+        return cls(pairs, id_switches, np.array(poses, dtype=np.int64), moved, shown, explained)
 
 
 def _moved_images(solution: Solution, out: BoolArray) -> IntArray:
     """Images (V, 2), pose and view, mostly rejected by ``out`` (V, N), that fit a camera that moved a little.
 
     It shifts, turns and scales the image, and is small against the spread of its markers, as the motion by a
-    wrong joint is not.
+    wrong joint is not, unless another view shows that no joint is wrong.
     """
     problem, sigma, found = solution.problem, solution.sigma_px, list[tuple[int, int]]()
     detections = problem.detections
@@ -107,7 +112,11 @@ def _moved_images(solution: Solution, out: BoolArray) -> IntArray:
 
         fit = least_squares(left, np.zeros(4), loss="soft_l1", f_scale=sigma)
         median = float(np.median(np.linalg.norm(fit.fun.reshape(-1, 2), axis=1)))
-        if median <= _CORRECTED * RAYLEIGH * sigma and np.abs(fit.x).max() <= _SMALL_MOTION * radius:
+        at = detections.pose_of == k
+        seen, used = (detections.seen & at).sum(axis=1), (solution.used & at).sum(axis=1)
+        alone = bool((used > _MOSTLY * np.maximum(seen, _SEEN_OF_IMAGE)).any())
+        small = np.abs(fit.x).max() <= _SMALL_MOTION * radius
+        if median <= _CORRECTED * RAYLEIGH * sigma and (alone or small):
             found.append((int(k), view))
     for view in {view for _, view in found}:
         found += [(k, view) for k in _settling(detections, residual[view], out[view], view, found)]

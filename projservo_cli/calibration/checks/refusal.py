@@ -6,6 +6,7 @@ import numpy as np
 
 from projservo_cli.calibration.bundle_adjustment import LeastSquares
 from projservo_cli.calibration.checks.model_error import stepped
+from projservo_cli.calibration.checks.other_poses import other_order
 from projservo_cli.calibration.checks.outliers import MAX_OF_POSE, Outliers, fits_other_joints
 from projservo_cli.calibration.checks.quality import check_model
 from projservo_cli.calibration.checks.validation import cross_validate
@@ -185,6 +186,7 @@ def _wrong_order(solution: Solution, rejected: BoolArray) -> Finding | None:
     """Find poses of several joints that are rejected where those of one are not, or None.
 
     One joint at a time moves alike whichever column its readings are in: only together they show the order.
+    Where no other order explains these poses, joints err by more than the readings of trials show.
     rejected : (V, K) views of poses that mostly are.
     """
     detections, lost = solution.problem.detections, rejected.all(axis=0)
@@ -195,8 +197,9 @@ def _wrong_order(solution: Solution, rejected: BoolArray) -> Finding | None:
     few = wrong < max(_WRONG_POSES, _WRONG_SHARE * count)
     if few or alone * count > _OTHERS_SHARE * wrong * others:
         return None
-    rest = Finding("joint_order", REFUSES, amount=int(alone), limit=int(others), unit="1")
-    return Finding("joint_order", REFUSES, amount=int(wrong), limit=int(count), unit="1", others=(rest,))
+    code = "joint_order" if other_order(solution, np.flatnonzero(several & lost)) else "several_joints"
+    rest = Finding(code, REFUSES, amount=int(alone), limit=int(others), unit="1")
+    return Finding(code, REFUSES, amount=int(wrong), limit=int(count), unit="1", others=(rest,))
 
 
 def contradiction(

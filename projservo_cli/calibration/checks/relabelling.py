@@ -52,6 +52,7 @@ class _Data(NamedTuple):
 
     detections: Detections
     q_reference: FloatArray
+    onset: int | None = None  # row of the pose from which on a fit rejects nearly all
 
     def with_(
         self, code: str, subject: Subject, unit: str = "", amount: float = np.nan, **changed: Any
@@ -165,6 +166,20 @@ def _units(data: _Data) -> Iterator[Relabelling]:
         yield data.with_("joint_unit", data.of_joint(i, name=name), q=q, q_0=q_0)
 
 
+def _late_from(data: _Data) -> Iterator[Relabelling]:
+    """Images that come one pose late or early against their readings, from a pose on."""
+    d, at = data.detections, data.onset
+    if at is None or not 0 < at < len(d.q) - 1:
+        return
+    subject = Subject(poses=(int(d.pose[at]),))
+    shifted = {
+        "images_late_from": d.q[at - 1 : -1],
+        "images_early_from": np.vstack([d.q[at + 1 :], d.q[-1:]]),
+    }
+    for code, q in shifted.items():
+        yield data.with_(code, subject, "1", len(q), q=np.vstack([d.q[:at], q]))
+
+
 def _sizes(data: _Data) -> Iterator[Relabelling]:
     """Images of another size from the pose on at which their extent changes most."""
     d = data.detections
@@ -175,20 +190,23 @@ def _sizes(data: _Data) -> Iterator[Relabelling]:
 
 # All relabellings by which the same images may fit: the simple ones first, then those by which more would.
 SIMPLE = (_mounts, _orders_of_images, _types, _standing)
-OTHERS = (_exchanged, _couplings, _parallelograms, _units, _sizes)
+OTHERS = (_exchanged, _couplings, _parallelograms, _units, _sizes, _late_from)
 
 
-def relabelled(search: Search, max_px: float, straight: Sequence[int] | None = None) -> Relabelling | None:
+def relabelled(
+    search: Search, max_px: float, straight: Sequence[int] | None = None, onset: int | None = None
+) -> Relabelling | None:
     """Find the one thing that is not as given with which the model fits.
 
     A rough fit compares all of a kind. The best are fitted completely and accepted only if the fit passes as
     a calibration does, with a noise of at most ``max_px``.
 
-    straight : joints that alone may be of the other type.
+    straight : joints that alone may be of the other type; onset : row of the pose from which on a fit rejects
+        nearly all.
     """
     detections = search.problem.detections
     few = detections.of_markers(starting_markers(detections, search.epipolar, search.rng))
-    data = _Data(few, search.problem.q_reference)
+    data = _Data(few, search.problem.q_reference, onset)
     if straight is not None:
         types = list(_types(data))
         return _best(search, max_px, [types[i] for i in straight])

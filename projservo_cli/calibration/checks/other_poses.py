@@ -1,0 +1,94 @@
+"""Poses that a fit rejects: images that show another pose, joints that come in another order."""
+
+import dataclasses
+from collections.abc import Iterator
+from itertools import permutations
+
+import numpy as np
+
+from projservo_cli.calibration.detections import RAYLEIGH, Detections
+from projservo_cli.calibration.robust_fit import Solution
+from projservo_cli.findings import LIMITS, Finding, Subject
+from projservo_cli.records import BoolArray, FloatArray, IntArray
+
+# Median residual, in σ, below which images show a pose.
+_SHOWS = 3.0
+# Share of the detections of an image that are rejected where it may show another pose, and minimum number.
+_MOSTLY, _SEEN = 0.5, 4
+# Median residual by another order of joints over that by the order as given, below which it explains poses;
+# maximum number of joints of which all orders are tried, and of markers by which.
+_EXPLAINS, _MOST_JOINTS, _ORDERED = 0.2, 6, 8
+
+
+def shown_poses(solution: Solution, out: BoolArray) -> IntArray:
+    """Images (P, 3), row of the pose, view and row of the pose that they show; others of that pose are kept.
+
+    out : (V, N) rejected detections, most of those of each of these images.
+    """
+    detections, found = solution.problem.detections, list[tuple[int, int, int]]()
+    poses, limit_px = detections.pose_of, _limit_px(solution)
+    predicted = np.empty((0,))
+    for k in np.unique(poses[out.any(axis=0)]).tolist():
+        at = poses == k
+        seen, gone = (detections.seen & at).sum(axis=1), (out & at).sum(axis=1)
+        off, kept = (gone > _MOSTLY * seen) & (seen >= _SEEN), (seen >= _SEEN) & (gone < _MOSTLY * seen)
+        if not kept.any():
+            continue
+        for v in np.flatnonzero(off).tolist():
+            predicted = predicted if predicted.size else _of_all_poses(solution)
+            rows = np.flatnonzero(detections.seen[v] & at)
+            apart = predicted[:, v, detections.marker_of[rows]] - detections.pixels[v, rows]
+            level = np.nan_to_num(np.median(np.linalg.norm(apart, axis=2), axis=1), nan=np.inf)
+            level[k] = np.inf
+            if level.min() <= limit_px:
+                found.append((k, v, int(np.argmin(level))))
+    return np.array(found, dtype=np.int64).reshape(-1, 3)
+
+
+def on_shown_poses(detections: Detections, shown: IntArray) -> Iterator[Finding]:
+    """Findings on images (P, 3) that show other poses, one for each view."""
+    for v, name in enumerate(detections.view):
+        if (of_view := shown[shown[:, 1] == v]).size:
+            poses, others = (tuple(detections.pose[of_view[:, i]].tolist()) for i in (0, 2))
+            instead = Finding("shown_poses", subject=Subject(poses=others))
+            yield Finding("other_pose", LIMITS, Subject(views=(name,), poses=poses), others=(instead,))
+
+
+def other_order(solution: Solution, poses: IntArray) -> bool:
+    """Whether joints in another order explain poses, by rows, that a fit rejects.
+
+    Trials of one joint each give its operator, whatever the order; of many joints only neighbours are tried
+    in each other's places.
+    """
+    solution = solution.thinned(_ORDERED)
+    problem, params = solution.problem, solution.params
+    detections, n = problem.detections, len(params.H_hat)
+    rows = np.flatnonzero(np.isin(detections.pose_of, poses))
+    k = np.searchsorted(poses, detections.pose_of[rows])
+
+    def level(order: tuple[int, ...]) -> float:
+        """Median residual, px."""
+        some = list(order)
+        moved = dataclasses.replace(
+            params, H_hat=params.H_hat[some], prismatic=params.prismatic[some], curve=None
+        )
+        images = moved.predict(problem.q[poses][:, some])[k, :, detections.marker_of[rows]].swapaxes(0, 1)
+        off = np.linalg.norm(images - detections.pixels[:, rows], axis=2)[detections.seen[:, rows]]
+        return float(np.median(np.nan_to_num(off, nan=np.inf)))
+
+    given = tuple(range(n))
+    if n <= _MOST_JOINTS:
+        orders = list(permutations(given))[1:]
+    else:
+        orders = [(*given[:i], i + 1, i, *given[i + 2 :]) for i in range(n - 1)]
+    return min(map(level, orders)) <= _EXPLAINS * level(given) if len(poses) and orders else False
+
+
+def _of_all_poses(solution: Solution) -> FloatArray:
+    """Pixels (K, V, m, 2) by the readings of all poses."""
+    return solution.params.predict(solution.problem.joints(solution.params))
+
+
+def _limit_px(solution: Solution) -> float:
+    """Median residual, px, of images that show a pose, with the noise of joints."""
+    return _SHOWS * RAYLEIGH * float(np.hypot(solution.sigma_px, solution.joint_effect()[1]))
