@@ -285,6 +285,19 @@ class Observation:
     )
     view: tuple[str, ...] = _scalar(about="names of the views", default=VIEWS)
 
+    @classmethod
+    def of_one(
+        cls,
+        marker: IntArray,
+        q: FloatArray,
+        images: FloatArray,
+        view: tuple[str, ...],
+        sigma: FloatArray | None = None,
+    ) -> "Observation":
+        """Images (V, m, 2) of joints (n,), with the deviations (V, m) of their pixels, if stated."""
+        none, stated = np.zeros(1, dtype=np.int64), None if sigma is None else sigma[None]
+        return cls(pose=none, marker=marker, q=q[None], images=images[None], sigma=stated, view=view)
+
     def rows(self, keep: BoolArray) -> "Observation":
         """Some of the poses (K,)."""
         kept: dict[str, Any] = {}

@@ -88,7 +88,7 @@ _AT_ONCE = 20
 _POSES = 60
 
 
-class _ViewError(NamedTuple):
+class ViewError(NamedTuple):
     """Distance of the images of a view from their prediction, and the expected one, medians, px."""
 
     view: str
@@ -107,7 +107,7 @@ class _ViewError(NamedTuple):
         return Finding("view_off", severity, Subject(views=(self.view,)), self.off_px, limit=limit, unit="px")
 
 
-def view_errors(calibration: Calibration, observation: Observation) -> tuple[_ViewError, ...]:
+def view_errors(calibration: Calibration, observation: Observation) -> tuple[ViewError, ...]:
     """Compare the images of each view at joint readings with their prediction.
 
     Raises InputError if the calibration has no covariance, or readings have another number of joints.
@@ -185,14 +185,14 @@ class _Images:
             variance += ((self.problem.joint_derivative(params) * self.problem.tau) ** 2).sum(axis=(2, 3))
         return np.asarray(np.sqrt(0.5 * variance))
 
-    def errors_of_views(self, params: Parameters, errors: Errors) -> tuple[_ViewError, ...]:
+    def errors_of_views(self, params: Parameters, errors: Errors) -> tuple[ViewError, ...]:
         """Distances of all views from their prediction, and the expected ones."""
         found, result = self.problem.detections, []
         distance = np.linalg.norm(self.problem.residual(params), axis=2) / found.weight
         expected = RAYLEIGH * self.deviation(params, errors) / found.weight
         for v, (name, seen) in enumerate(zip(found.view, found.seen, strict=True)):
             off = (float(np.median(px[v, seen])) if seen.any() else np.nan for px in (distance, expected))
-            result.append(_ViewError(name, *off))
+            result.append(ViewError(name, *off))
         return tuple(result)
 
     @property

@@ -341,7 +341,8 @@ def _validate(
 
     Compares the pixels of an observation table (--data) with those the calibration of a run predicts at the
     table's joint readings. Ends in exit code 1 where their median distance passes three times the stated
-    error and the noise of the images together, or where that of one camera shows that it was moved.
+    error and the noise of the images together, or where that of one camera shows that it was moved. A table of
+    one posture is judged as doctor judges an arm at rest; of several, what changed is told beside the medians.
 
     With --metric it compares positions that another instrument measured, such as a laser tracker. Its scale,
     its pose and the place of its point on the tool are fitted to --fit.
@@ -357,17 +358,18 @@ def _validate(
         raise click.UsageError("--readings are the joints beside --data, which is not given")
     if data is not None and metric is not None:
         raise click.UsageError("--data and --metric: validate takes one of them; leave the other out")
-    from projservo_cli.calibration.checks.validation import median_limit, residual_statistics
+    from projservo_cli.calibration.checks.validation import median_limit
     from projservo_cli.config import load_config
     from projservo_cli.findings import REFUSES
+    from projservo_cli.stages.validate import compared
     from projservo_cli.store.observation_tables import read_detections, read_table
     from projservo_cli.store.run_file import load
     from projservo_cli.words import failed, order_advice, sentence, setup_of
 
     found = load(target)
     calibration = found.calibration
+    config = load_config(found.path, text=found.results["calibrate"].configuration)
     if joint_unit is None:
-        config = load_config(found.path, text=found.results["calibrate"].configuration)
         joint_unit = config.data.joint_unit if config.data is not None else None
     if data is None:
         value = _position_errors(calibration, (metric, fit), joint_unit, arm_std_mm)
@@ -386,7 +388,8 @@ def _validate(
         return
     unit = calibration.joint_types, joint_unit
     observation = read_table(data, *unit) if readings is None else read_detections(data, readings, *unit)
-    value = {"run": found.path.resolve(), **residual_statistics(calibration, observation)}
+    compared_with = compared(calibration, observation, config.image_size_px)
+    value, setup = {"run": found.path.resolve(), **compared_with}, setup_of(calibration)
     for text in value.get("advice", ()):
         console.say(f"validate: {text}")
     skipped = ", ".join(f"{count} {why.replace('_', ' ')}" for why, count in value["skipped"].items())
@@ -407,14 +410,15 @@ def _validate(
     if not refusing:
         return
     one = refusing[0]
-    again = f"projservo calibrate {target} --refit {''.join(one.subject.views[:1])} --data {data}"
-    one = replace(one, subject=replace(one.subject, name=again))
+    if one.code == "contradicted_in_part":
+        again = f"projservo calibrate {target} --refit {''.join(one.subject.views[:1])} --data {data}"
+        one = replace(one, subject=replace(one.subject, name=again))
     left_open, n = order_advice(calibration), len(calibration.joint_types)
     order = calibration.undecided_order
     if order is not None and order.size == n * (n - 1):  # all reversed is the other mount
         left_open += "; no pose shows whether the cameras are on the tool (--mount) either"
     left_open = f"; {left_open}" if left_open else ""
-    raise failed([one], setup_of(calibration), left_open, stage=str(data))
+    raise failed([one], setup, left_open, stage=str(data))
 
 
 def _position_errors(

@@ -153,6 +153,7 @@ def preflight_inputs(config: Config) -> PreflightInputs:
         lengths=config.markers.lengths(face),
         dictionary=_dictionary(config),
         mount=config.mount,
+        noise_px=(config.stop.innovation_threshold or 1.0) * config.noise.servo_px,
         board=_board(config),
     )
 

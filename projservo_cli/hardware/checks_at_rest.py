@@ -7,11 +7,12 @@ from itertools import combinations, product
 
 import numpy as np
 
+from projservo_cli.calibration.checks.validation import of_views
 from projservo_cli.detection import MIN_CELL, BoardFinder, Corners, Finder, TagFinder, dictionaries
 from projservo_cli.findings import LIMITS, NOTE, REFUSES, Finding, Subject
 from projservo_cli.hardware.camera_robot import View, exposure_of
 from projservo_cli.hardware.video_cameras import VideoCamera, stable_name
-from projservo_cli.records import CORNERS, BoolArray, ByteArray, FloatArray, JointLimits
+from projservo_cli.records import CORNERS, BoolArray, ByteArray, FloatArray, JointLimits, Observation
 
 # Width of a cell, px, from which corners are good.
 _GOOD_CELL = 4.0
@@ -39,11 +40,32 @@ class RobotAtRest:
     s: FloatArray  # (V, m, 2) mean of the pixels, NaN where most frames do not show a marker
     sigma: FloatArray | None  # (V, m) deviation of a corner of one frame as the detector states it, px
     scatter: FloatArray  # (V, m) between frames, px
+    shown: Observation  # the frames
+    fresh: BoolArray  # (K, V) which of them are new
     limits: JointLimits
     units: Sequence[str]  # of the joints: deg, rad or m
     views: Sequence[View] = ()  # the last one of each camera of projservo
     cameras: Sequence[VideoCamera] = ()
     health: Mapping[str, float | str] = field(default_factory=dict)  # such as the voltage
+
+    def of_views(self, names: tuple[str, ...]) -> "RobotAtRest":
+        """Return what some cameras show; raises InputError if there is none of a name."""
+        shown, rows = of_views(self.shown, names), [self.shown.view.index(name) for name in names]
+        return replace(
+            self,
+            s=self.s[rows],
+            sigma=None if self.sigma is None else self.sigma[rows],
+            scatter=self.scatter[rows],
+            shown=shown,
+            fresh=self.fresh[:, rows],
+            views=[self.views[v] for v in rows] if self.views else (),
+            cameras=[self.cameras[v] for v in rows] if self.cameras else (),
+        )
+
+    @property
+    def frame_sizes(self) -> list[tuple[int, int]] | None:
+        """Width and height of the frames of each camera of projservo, px; None without one."""
+        return [(view.frame.grey.shape[1], view.frame.grey.shape[0]) for view in self.views] or None
 
 
 def findings_at_rest(

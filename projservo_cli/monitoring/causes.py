@@ -1,13 +1,18 @@
 """Causes of a fault as findings."""
 
+from itertools import product
+
 import numpy as np
 
 from projservo_cli.findings import REFUSES, Finding, Subject
 from projservo_cli.monitoring.hypotheses import ALL, Explanation
-from projservo_cli.records import CORNERS, Calibration, FloatArray
+from projservo_cli.records import CORNERS, Calibration, FloatArray, IntArray
 
 # By so much a link may flex under its load, rad, which looks like a joint that slipped.
 _FLEXIBLE = np.radians(1.0)
+# A tag that is off by less than this share of its side is neither turned by quarters nor exchanged; share of
+# that which may be left where it is.
+_SIDE, _FITS = 0.5, 0.15
 # Codes by the kind of a cause whose amount is by how much images show it, and of others with their units.
 _SEEN = {
     "exchanged": "exchanged_cameras",
@@ -79,3 +84,31 @@ def _displaced(explanation: Explanation, calibration: Calibration) -> Finding:
     subject = Subject(markers=tuple(moved), tag=moved[0] // CORNERS if whole else None)
     code = "displaced_tag" if whole else "displaced_markers"
     return Finding(code, REFUSES, subject, explanation.seen_px, unit="px")
+
+
+def misplaced_tags(pixels: FloatArray, expected: FloatArray, numbers: IntArray) -> tuple[Finding, ...]:
+    """Return the tags that are turned by quarters, or in each other's places.
+
+    pixels, expected : (V, m, 2) px. If most are, the tool is: its body looks alike from several sides.
+    """
+    tags = {int(tag): np.flatnonzero(numbers // CORNERS == tag) for tag in np.unique(numbers // CORNERS)}
+    tags = {tag: at for tag, at in tags.items() if len(at) == CORNERS and np.isfinite(pixels[:, at]).any()}
+    moved_to: dict[int, tuple[int, int]] = {}
+
+    def rms(tag: int, place: int, turn: int) -> float:
+        off = pixels[:, tags[tag]] - np.roll(expected[:, tags[place]], turn, axis=1)
+        return float(np.sqrt(np.nanmean(np.square(off).sum(axis=-1))))
+
+    for tag, at in tags.items():
+        side = np.linalg.norm(expected[:, at] - np.roll(expected[:, at], 1, axis=1), axis=-1).mean()
+        own, best = rms(tag, tag, 0), min(product(tags, range(CORNERS)), key=lambda to: rms(tag, *to))
+        if own > _SIDE * side and best != (tag, 0) and rms(tag, *best) < _FITS * own:
+            moved_to[tag] = best
+    found = []
+    for tag, (place, turn) in moved_to.items():
+        if place == tag:
+            by = np.pi if turn == 2 else np.pi / 2.0
+            found.append(Finding("turned_tag", subject=Subject(tag=tag), amount=by, unit="rad"))
+        elif place not in moved_to or tag < place:
+            found.append(Finding("exchanged_tags", subject=Subject(markers=(tag, place))))
+    return () if 2 * len(moved_to) > len(tags) else tuple(found)

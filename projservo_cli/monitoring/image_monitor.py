@@ -1,17 +1,16 @@
 """Monitor of a run: tests each observation, holds the arm while they disagree, and names the fault."""
 
 from collections import deque
-from itertools import product
 from typing import NamedTuple
 
 import numpy as np
 
 from projservo_cli.calibration.detections import even_choice
-from projservo_cli.calibration.prediction import CAMERA, predict
+from projservo_cli.calibration.prediction import CAMERA
 from projservo_cli.findings import REFUSES, Finding, Subject
 from projservo_cli.monitoring.accuracy import Posture
-from projservo_cli.monitoring.causes import finding_of, group_of, is_slight
-from projservo_cli.monitoring.frame_pairs import FramePair, Pairing, TimedImage, at_known_markers, mean_image
+from projservo_cli.monitoring.causes import finding_of, group_of, is_slight, misplaced_tags
+from projservo_cli.monitoring.frame_pairs import FramePair, Pairing, TimedImage, mean_image
 from projservo_cli.monitoring.hypotheses import (
     Evidence,
     Explanation,
@@ -30,7 +29,7 @@ from projservo_cli.monitoring.innovation_tests import (
     Sums,
     is_same_view,
 )
-from projservo_cli.records import CORNERS, BoolArray, Calibration, FloatArray, IntArray
+from projservo_cli.records import BoolArray, Calibration, FloatArray, IntArray, Observation
 
 # Markers that are tested, at most.
 _MOST_TESTED = 40
@@ -38,7 +37,7 @@ _MOST_TESTED = 40
 _VAGUE = 10.0
 # Causes are fitted after these numbers of observations that disagree, since blur passes. From the fourth on
 # two are named that are as likely; after the last the fault has no name: a hand passes in two seconds.
-_NAMED_AT = (5, 7, 10, 15, 25, 40, 60)
+NAMED_AT = (5, 7, 10, 15, 25, 40, 60)
 _TWO_AT = 15
 # Advantage over the next cause, twice the logarithm of odds, at which one is named alone.
 _CLEAR = 2.0 * np.log(100.0)
@@ -47,11 +46,9 @@ _LEFT = 0.15
 # Share of the pixels that images are off by which a cause changes them at least: backlash that is
 # more than the calibration found is no turn of a camera by the rest.
 _LEAST_PART = 0.2
-# A tag that is off by less than this share of its side is neither turned by quarters nor exchanged.
-_SIDE = 0.5
 # A corner that is off by less, px, from one side of the tool may be an edge that the finder took for another;
 # one that a single camera watches may also be pulled by what covers its edge, by a few pixels.
-_LEAST_MOVED_PX, _LEAST_MOVED_ALONE_PX = 1.0, 8.0
+LEAST_MOVED_PX, _LEAST_MOVED_ALONE_PX = 1.0, 8.0
 # Share of the markers that a view saw shortly before: one that sees less is covered by something.
 _COVERED = 0.5
 # Share of the detections of a view that may not be off by themselves for long: then the view is.
@@ -66,8 +63,6 @@ _SUFFICE = 2
 _MOST_NAMED, _MOST_NAMED_BY_ONE = 2, 3
 # Observations that are remembered one by one.
 _REMEMBERED = 80
-# Chance of a false alarm of one observation alone: that of an observation among so many.
-_SINGLE = 1000
 # Joints that differ by no more since the first observation have not moved, rad or m.
 _AT_REST = 1e-3
 
@@ -139,8 +134,8 @@ class ImageMonitor:
         self._shown = visible[even_choice(len(visible), _MOST_TESTED)]
         self.calibration = calibration.with_markers(self._shown)
         has_size = image_size is not None and bool(np.isfinite(image_size).all())
+        self.image_size, self.sigma_px = image_size if has_size else None, sigma_px
         self._centre = 0.5 * (np.asarray(image_size) - 1.0) if has_size else None
-        self._image_size, self._sigma_px = image_size if has_size else None, sigma_px
         self._errors = ErrorModel(self.calibration, sigma_px)
         self._detector = Detector(self._errors, max_observations)
         self._pairing = Pairing(views)
@@ -213,21 +208,22 @@ class ImageMonitor:
             self._take(pair)
         return self.fault
 
-    def fault_at_rest(self) -> Finding | None:
-        """Return the fault that the mean of the last observations of one posture shows; None for none."""
+    def mean_at_rest(self) -> Observation | None:
+        """Return the mean of the last observations of one posture, as one; None where there is none.
+
+        It has the deviations of its frames, if the finder states them: errors of a finder that stay do not
+        average away.
+        """
         # A hand that covers a part of a view may pull the corners next to it.
         last = [tested for tested in self._kept if tested.view == self._view and not tested.covered]
         last = [tested for tested in last if np.abs(tested.pair.q - last[-1].pair.q).max() <= _AT_REST]
-        if not last or self.pending:
-            return self.fault
+        if not last:
+            return None
         seen = [np.where(tested.residual.seen[..., None], tested.pair.images, np.nan) for tested in last]
-        mean, numbers = mean_image(np.array(seen)), self.calibration.marker
         sigma = [tested.stated[..., None] for tested in last if tested.stated is not None]
-        # Errors of a finder that stay do not average away: no mean is as sure as its frames are said to be.
+        q, images = np.mean([tested.pair.q for tested in last], axis=(0, 1)), mean_image(np.array(seen))
         stated = self._errors.raised(mean_image(np.array(sigma))[..., 0]) if sigma else None
-        q = np.mean([tested.pair.q for tested in last], axis=(0, 1))
-        size = self._image_size
-        return detected_fault(self.calibration, q, numbers, mean, size, self._sigma_px, stated=stated)
+        return Observation.of_one(self.calibration.marker, q, images, self.calibration.view, stated)
 
     def undetected_mm(self, q: FloatArray, used: BoolArray, posture: Posture) -> float:
         """Return how far off the face may be at joints (n,) by what no test tells from none, mm.
@@ -310,7 +306,7 @@ class ImageMonitor:
             self._onset, self._before = self.observations - 1, self._detector.memory.total
         self._off += 1
         self.agreeing = self._agreed = 0
-        if self._off not in _NAMED_AT:
+        if self._off not in NAMED_AT:
             return
         kept = self._since_onset()
         if self._has_passed(kept[len(kept) // 2 :]):
@@ -325,7 +321,7 @@ class ImageMonitor:
             self._off = 0
             return
         clear = self._off >= _TWO_AT or len(_rivals(fits)) == 1
-        if (explains and clear and not self._kept[-1].covered) or self._off == _NAMED_AT[-1]:
+        if (explains and clear and not self._kept[-1].covered) or self._off == NAMED_AT[-1]:
             self.fault = self._finding(fits)
 
     def _crowd_is_fault(self) -> bool:
@@ -380,7 +376,7 @@ class ImageMonitor:
         Frames of the views that come one after the other may make that two.
         """
         kept = self._kept[-max(1, self.observations - self._onset) :]
-        return kept[1 + (self._off > _NAMED_AT[0]) :] if len(kept) >= _NAMED_AT[0] else kept
+        return kept[1 + (self._off > NAMED_AT[0]) :] if len(kept) >= NAMED_AT[0] else kept
 
     def _explanations(
         self, kept: list[_Kept], before: Sums, markers: list[int] | None = None
@@ -400,11 +396,26 @@ class ImageMonitor:
         minimum = min(fits, key=lambda fit: fit.left)
         self._unit = max(1.0, minimum.left / max(1.0, evidence.rows - minimum.theta.size))
         fits = [fit._replace(gain=fit.gain / self._unit, left=fit.left / self._unit) for fit in fits]
+        # Of causes without a parameter the unit is not known: corners err otherwise from the other side.
+        discrete = [not fit.theta.size and self._explains(fit) for fit in fits]
+        fits = [
+            self._by_any_unit(fit, minimum) if alone else fit
+            for fit, alone in zip(fits, discrete, strict=True)
+        ]
         fits.sort(key=lambda fit: -fit.score)
         if fits[0].cause.kind != "marker":
             return fits
         moved = [fit for fit in fits if fit.cause.kind == "marker" and fit.score > _CLEAR] or fits[:1]
         return [together(moved), *(fit for fit in fits if fit.cause.kind != "marker")]
+
+    def _by_any_unit(self, fit: Explanation, minimum: Explanation) -> Explanation:
+        """Return a cause with its odds against the fit that leaves the least, where both have their own unit.
+
+        Source: [MacKay 1992], with the unit integrated out.
+        """
+        least = max(minimum.left / self._unit, 1e-9)  # of exact images rounding is left
+        more = self._evidence_now.rows * np.log(max(fit.left / least, 1.0))
+        return fit._replace(gain=max(fit.gain, float(minimum.gain / self._unit - more)))
 
     def _frozen(self, fit: Explanation) -> Explanation:
         """Turn a slip by as far as the set-point went without the reading into a frozen reading."""
@@ -459,7 +470,7 @@ class ImageMonitor:
         detected = self._evidence_now.seen[:, :, list(fit.cause.markers)]
         one = detected.shape[1] == 1
         alone = not one and (detected.sum(axis=1) > 1).sum() <= 0.5 * detected.any(axis=1).sum()
-        if alone or fit.min_px >= (_LEAST_MOVED_ALONE_PX if one else _LEAST_MOVED_PX):
+        if alone or fit.min_px >= (_LEAST_MOVED_ALONE_PX if one else LEAST_MOVED_PX):
             return bool(alone)
         return self._errors.slants(np.array([tested.pair.q.mean(axis=0) for tested in kept])) < WINDOW
 
@@ -467,15 +478,15 @@ class ImageMonitor:
         """Name markers that two views show off by themselves for long."""
         in_both, in_either = np.sort([np.zeros_like(self._asides[0]), *self._asides], axis=0)[-2:]
         # What hides an edge shows in one view, and passes; one camera is believed after a hand has passed.
-        long = in_either >= (_NAMED_AT[-1] if len(self._asides) == 1 else np.inf)
-        due = (in_both == _NAMED_AT[0]) | (in_either == _TWO_AT) | (long & (in_either == _NAMED_AT[-1]))
+        long = in_either >= (NAMED_AT[-1] if len(self._asides) == 1 else np.inf)
+        due = (in_both == NAMED_AT[0]) | (in_either == _TWO_AT) | (long & (in_either == NAMED_AT[-1]))
         if self.pending or not due.any():
             return
         before, moved = self._detector.memory.total, []
         for j in np.flatnonzero(in_either).tolist():
             kept = [
                 tested._replace(residual=tested.residual.without(_all_but(tested.residual.seen, j)))
-                for tested in self._kept[-max(_NAMED_AT[0], int(in_either[j])) :]
+                for tested in self._kept[-max(NAMED_AT[0], int(in_either[j])) :]
             ]
             fits = self._explanations(kept, before, [j])
             if not fits:
@@ -489,7 +500,9 @@ class ImageMonitor:
 
     def _finding(self, fits: list[Explanation]) -> Finding:
         """Return the fault with the likeliest of causes."""
-        residual = self._kept[-1].residual
+        pair, residual = self._kept[-1][:2]
+        if misplaced := misplaced_tags(pair.images, residual.predicted, self.calibration.marker):
+            return Finding("misplaced_tags", REFUSES, others=misplaced)
         square = np.square(residual.r).reshape(len(residual.seen), -1).sum(axis=1)
         rms = np.sqrt(square / np.maximum(residual.seen.sum(axis=1), 1)).max()  # of the view that is most off
         if not self._explains(fits[0]):
@@ -510,106 +523,6 @@ class ImageMonitor:
         square = np.square(residual.r.reshape(*residual.seen.shape, 2)).sum(axis=-1)
         view, j = np.unravel_index(int(np.argmax(square)), square.shape)
         return Subject(views=(self.calibration.view[view],), markers=(int(self.calibration.marker[j]),))
-
-
-def detected_fault(
-    calibration: Calibration,
-    q: FloatArray,
-    marker: IntArray,
-    images: FloatArray,
-    image_size: FloatArray | None,
-    sigma_px: float = 0.0,
-    *,
-    stated: FloatArray | None = None,
-) -> Finding | None:
-    """Return what changed since the calibration, by images of one posture at rest; None for nothing.
-
-    Tags that are off by themselves by less than ``_LEAST_MOVED_PX``, up to half of them, are no change: one
-    view of the tool does not tell a tag that moved from one that is bent, or under a slant.
-
-    q : (n,) joint readings there, rad or m; images : (V, b, 2) pixels of the markers with the numbers
-    marker (b,), NaN where unseen, those that the calibration does not know among them;
-    image_size : (V, 2) px; sigma_px : pixel noise per coordinate where that is more than the calibration's.
-    stated : (V, m) deviations of the pixels of the markers of the calibration, px, if the finder states them.
-    """
-    if not calibration.usable or not calibration.has_covariance:
-        return None
-    pixels = at_known_markers(calibration, marker, images)
-    V = len(calibration.P)
-    rest, instants, new = np.zeros((V, len(q))), np.zeros(V), np.ones(V, dtype=np.bool_)
-
-    def fault_of(pixels: FloatArray) -> Finding | None:
-        sigma = max(calibration.sigma_px, sigma_px)
-        monitor, q_views = ImageMonitor(calibration, sigma, _SINGLE, image_size=image_size), np.stack([q] * V)
-        monitor.observe(instants, q_views, rest, instants, pixels, new, stated=stated)
-        enough = _NAMED_AT[-1 if V == 1 else 0]
-        for k in range(1, enough * bool(monitor.rejected.any() and not monitor.pending)):
-            monitor.observe(instants + k, q_views, rest, instants, pixels, new, stated=stated)
-        return monitor.give_up()
-
-    expected = predict(calibration, q[None])[0]
-    if misplaced := _misplaced(pixels, expected, calibration.marker):
-        return Finding("misplaced_tags", REFUSES, others=misplaced)
-    fault = fault_of(pixels)
-    if fault is None:
-        return None
-    off, tags = pixels - expected, calibration.marker // CORNERS
-    for _ in range(len(np.unique(tags[np.isfinite(off).any(axis=(0, 2))])) // 2):
-        tag = _off_alone(off[np.isfinite(off).any(axis=(1, 2))], calibration.marker)
-        if not tag.any():
-            break
-        off, pixels = (np.where(tag[:, None], np.nan, part) for part in (off, pixels))
-        if fault_of(pixels) is None:
-            return None
-    return fault
-
-
-def _misplaced(pixels: FloatArray, expected: FloatArray, numbers: IntArray) -> tuple[Finding, ...]:
-    """Return the tags that are turned by quarters, or in each other's places, by pixels (V, m, 2).
-
-    If most are, the tool is: its body looks alike from several sides.
-    """
-    tags = {int(tag): np.flatnonzero(numbers // CORNERS == tag) for tag in np.unique(numbers // CORNERS)}
-    tags = {tag: at for tag, at in tags.items() if len(at) == CORNERS and np.isfinite(pixels[:, at]).any()}
-    moved_to: dict[int, tuple[int, int]] = {}
-
-    def rms(tag: int, place: int, turn: int) -> float:
-        off = pixels[:, tags[tag]] - np.roll(expected[:, tags[place]], turn, axis=1)
-        return float(np.sqrt(np.nanmean(np.square(off).sum(axis=-1))))
-
-    for tag, at in tags.items():
-        side = np.linalg.norm(expected[:, at] - np.roll(expected[:, at], 1, axis=1), axis=-1).mean()
-        own, best = rms(tag, tag, 0), min(product(tags, range(CORNERS)), key=lambda to: rms(tag, *to))
-        if own > _SIDE * side and best != (tag, 0) and rms(tag, *best) < _LEFT * own:
-            moved_to[tag] = best
-    found = []
-    for tag, (place, turn) in moved_to.items():
-        if place == tag:
-            by = np.pi if turn == 2 else np.pi / 2.0
-            found.append(Finding("turned_tag", subject=Subject(tag=tag), amount=by, unit="rad"))
-        elif place not in moved_to or tag < place:
-            found.append(Finding("exchanged_tags", subject=Subject(markers=(tag, place))))
-    return () if 2 * len(moved_to) > len(tags) else tuple(found)
-
-
-def _off_alone(off: FloatArray, numbers: IntArray) -> BoolArray:
-    """Markers (m,) of the tag that is the farthest off (V, m, 2), px; none where that is far, or most of all.
-
-    Errors of joints move all of them: a tag is off against the median of the others.
-    """
-    detected: BoolArray = np.isfinite(off[..., 0])
-    tags = numbers // CORNERS
-    worst, farthest = np.zeros(len(numbers), dtype=np.bool_), 0.0
-    for tag in np.unique(tags):
-        of_tag = np.isin(tags, tag)
-        own = detected[:, of_tag]
-        if (2 * own.sum(axis=1) > detected.sum(axis=1)).any() or not own.any():
-            continue
-        against = off[:, of_tag] - np.nanmedian(off[:, ~of_tag], axis=1, keepdims=True)
-        rms = float(np.sqrt(np.nanmean(np.square(against).sum(axis=-1))))
-        if rms > farthest:
-            worst, farthest = of_tag, rms
-    return worst if farthest < _LEAST_MOVED_PX else np.zeros_like(worst)
 
 
 def _rivals(fits: list[Explanation]) -> list[Explanation]:

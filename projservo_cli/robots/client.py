@@ -15,6 +15,7 @@ from projservo_cli.calibration.detections import MIN_SIGMA
 from projservo_cli.findings import LIMITS, REFUSES, Finding, Subject
 from projservo_cli.geometry.algebra import as_array
 from projservo_cli.geometry.kinematics import forward
+from projservo_cli.monitoring.at_rest import fault_of_mean
 from projservo_cli.monitoring.image_monitor import ImageMonitor
 from projservo_cli.monitoring.innovation_tests import WINDOW
 from projservo_cli.records import BoolArray, FloatArray, IntArray, WorkFailed
@@ -255,14 +256,14 @@ class DrivenRobot:
         return Finding("unseen_markers", LIMITS, Subject(views=tuple(dark)))
 
     def at_rest(self, *, held: bool = False) -> Finding | None:
-        """Return the fault that images show by the test of one posture, that of ``doctor``; else None.
+        """Return the fault that images of one posture show, as ``fault_at_rest`` tells it; else None.
 
         held : whether the arm may be held meanwhile, to see whether that lasts.
         """
         if (monitor := self.monitor) is not None:
             if held:
-                self._held_while(lambda: bool(monitor.fault_at_rest()), _LASTS)
-            self.disturbance = self.disturbance or monitor.fault_at_rest()
+                self._held_while(lambda: bool(fault_of_mean(monitor)), _LASTS)
+            self.disturbance = self.disturbance or fault_of_mean(monitor)
         return self.disturbance
 
     def _held_while(self, wrong: Callable[[], bool], looks: int) -> bool:

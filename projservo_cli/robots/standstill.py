@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from projservo_cli.findings import REFUSES, Finding, Subject
-from projservo_cli.records import FloatArray, IntArray
+from projservo_cli.records import BoolArray, FloatArray, IntArray, Observation
 from projservo_cli.robots.contract import PluginRobot, Reading
 from projservo_cli.words import failed
 
@@ -33,19 +33,42 @@ def at_rest(
 
 def seen_at_rest(
     robot: PluginRobot, observe: Callable[[], Reading], frames: int, settle_s: float, what: str
-) -> tuple[Reading, Reading, FloatArray, IntArray]:
+) -> tuple[Reading, Reading, FloatArray, IntArray, list[Reading]]:
     """Wait until a robot and its images stand still, and average frames of each view, objects included.
 
     Returns the first reading at rest, the mean, deviations (V, m) of a coordinate of it, px, NaN if unknown,
-    and counts (V, m).
+    counts (V, m), and the readings that it is of.
     """
     first, reading = robot.read(), observe()
     if reading.t_q > first.t_q:  # else it is a simulator, whose time passes in its commands alone
         reading = [reading, *at_rest(reading, observe, settle_s, what)][-1]
-    mean, squares, count = averaged(reading, observe, frames)
+    looks = [reading]
+
+    def look() -> Reading:
+        looks.append(observe())
+        return looks[-1]
+
+    mean, squares, count = averaged(reading, look, frames)
     sigma = np.where(count > 1, np.sqrt(squares / np.maximum(2 * count * (count - 1), 1)), np.nan)
     sigma = sigma if mean.sigma_px is None else mean.sigma_px
-    return reading, mean, np.where(np.isfinite(mean.s[..., 0]), sigma, np.nan), count
+    return reading, mean, np.where(np.isfinite(mean.s[..., 0]), sigma, np.nan), count, looks
+
+
+def frames_of(looks: list[Reading], marker: IntArray) -> tuple[Observation, BoolArray]:
+    """Return the frames of looks at a robot at rest, and which are new (K, V).
+
+    marker : (m,) numbers of the first markers, those on the tool.
+    """
+    stated = [look.sigma_px[:, : len(marker)] for look in looks if look.sigma_px is not None]
+    frames = Observation(
+        pose=np.arange(len(looks)),
+        marker=marker,
+        q=np.array([look.q for look in looks]),
+        images=np.array([look.s[:, : len(marker)] for look in looks]),
+        sigma=np.array(stated) if len(stated) == len(looks) else None,
+        view=looks[0].view,
+    )
+    return frames, np.array([b.new_views(a) for a, b in zip([None, *looks], looks, strict=False)])
 
 
 def averaged(

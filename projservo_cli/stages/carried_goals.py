@@ -147,7 +147,7 @@ def _seen(scenario: Scenario, carrier: CarryingObject, shared: Session | None) -
             time.sleep(robot.bounds.period)
             return robot.read().whole
 
-        _, mean, sigma, _ = seen_at_rest(robot, observe, carrier.frames, carrier.settle_s, "plan")
+        _, mean, sigma, *_ = seen_at_rest(robot, observe, carrier.frames, carrier.settle_s, "plan")
     which = [len(numbers) + driven.further.index(number) for number in carrier.numbers]
     return Look(mean.s[:, which], sigma[:, which])
 

@@ -3,29 +3,29 @@
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from projservo_cli import words
-from projservo_cli.calibration.refit import view_errors
+from projservo_cli.calibration.refit import ViewError, view_errors
 from projservo_cli.detection import DICTIONARY, finder_of
-from projservo_cli.findings import LIMITS, NOTE, REFUSES, Finding, told, usable
+from projservo_cli.findings import LIMITS, NOTE, REFUSES, Finding, Subject, told, usable
 from projservo_cli.hardware.camera_robot import CameraRobot, View
 from projservo_cli.hardware.checks_at_rest import RobotAtRest, findings_at_rest
 from projservo_cli.hardware.checks_in_motion import Strokes, findings_of, reach_of, strokes
 from projservo_cli.hardware.video_cameras import VideoCamera
 from projservo_cli.image_size import ImageSize, image_corners, image_sizes
 from projservo_cli.monitoring.accuracy import resting_error_mm
+from projservo_cli.monitoring.at_rest import fault_at_rest
 from projservo_cli.monitoring.frame_pairs import at_known_markers, mean_image
-from projservo_cli.monitoring.image_monitor import detected_fault
 from projservo_cli.planning.model_spread import Region
 from projservo_cli.planning.pose_selection import RefitPoses, refit_poses
 from projservo_cli.records import Calibration, FloatArray, InputError, Observation, WorkFailed
 from projservo_cli.robots.contract import PluginRobot, Reading, at_rest_after
 from projservo_cli.robots.pacing import Steered
+from projservo_cli.robots.standstill import frames_of
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.external_robot import plugin_robot
 from projservo_cli.stages.stage_inputs import OwnRobot, PreflightInputs
@@ -59,7 +59,7 @@ class Checked(NamedTuple):
     def refuted(self) -> str | None:
         """Reason why the calibration holds no more, empty where it does; None where it was not compared."""
         for one in self.findings:
-            if one.code in ("agrees", "refuted", "refuted_camera"):
+            if one.code in ("agrees", "refuted"):
                 return "" if one.code == "agrees" else words.sentence(one, self.setup)
         return None
 
@@ -93,9 +93,10 @@ def check(
                 at_rest, finder_of(inputs.board, dictionary), dictionary, moves=confirmed is not None
             )
             if calibration is not None:
-                found = calibration_finding(calibration, at_rest, robot.image_size, inputs.lengths)
-                found, mend = with_refit(found, calibration, at_rest, robot.image_size)
-                findings.append(found)
+                size, seen = robot.image_size, at_rest.of_views(calibration.view)
+                found = calibration_finding(calibration, seen, size, inputs.lengths, inputs.noise_px)
+                more, mend = mended_by_refit(found, calibration, seen, size)
+                findings += (found, *more)
             if confirmed is not None and not usable(findings):
                 findings.append(Finding("not_moved", LIMITS))
             elif confirmed is not None and confirmed(reach_of(joints.types)):
@@ -130,6 +131,8 @@ def _seen(robot: PluginRobot, inputs: PreflightInputs, progress: Progress) -> Ro
         readings.append(robot.read())
         progress("look", len(readings), wanted)
     s, scatter = zip(*(_mean(readings, view) for view in range(len(robot.view))), strict=True)
+    marker = np.array(inputs.numbers, dtype=np.int64)
+    shown, fresh = frames_of(readings, marker)
     own, cameras, views = robot.robot, list[VideoCamera](), list[View]()
     if isinstance(own, CameraRobot):
         cameras, views = own.cameras, [view for view in own.views if view is not None]
@@ -140,6 +143,8 @@ def _seen(robot: PluginRobot, inputs: PreflightInputs, progress: Progress) -> Ro
         s=np.stack(s),
         sigma=readings[-1].sigma_px,
         scatter=np.stack(scatter),
+        shown=shown,
+        fresh=fresh,
         limits=robot.bounds.limits,
         units=robot.bounds.units,
         views=views,
@@ -160,50 +165,54 @@ def _mean(readings: Sequence[Reading], view: int) -> tuple[FloatArray, FloatArra
 
 
 def calibration_finding(
-    calibration: Calibration, at_rest: RobotAtRest, image_size: ImageSize | None, lengths: FloatArray
+    calibration: Calibration,
+    at_rest: RobotAtRest,
+    image_size: ImageSize | None,
+    lengths: FloatArray,
+    noise_px: float = 0.0,
 ) -> Finding:
     """Whether images at rest still agree with a calibration, and what changed if they do not.
 
-    lengths : (f, f) between the markers of the face, m, NaN if unknown.
+    lengths : (f, f) between the markers of the face, m, NaN if unknown; noise_px : of the images of a run.
     """
     if not calibration.usable or not calibration.has_covariance:
         return Finding("unusable_calibration", LIMITS)
-    known = image_size or [view.frame.grey.shape[::-1] for view in at_rest.views] or None
-    size = image_sizes(known, calibration.view)
-    marker = np.array(at_rest.marker, dtype=np.int64)
+    size = image_sizes(image_size or at_rest.frame_sizes, calibration.view)
+    marker = at_rest.shown.marker
     if not np.isfinite(at_rest.s[:, np.isin(marker, calibration.marker)]).any():
         return Finding("uncompared", LIMITS)
-    if fault := detected_fault(calibration, at_rest.q, marker, at_rest.s, size):
-        return Finding("refuted", REFUSES, others=(fault,))
+    noise_px = max(noise_px, calibration.sigma_fitted_px)
+    if fault := fault_at_rest(calibration, at_rest.shown, size, sigma_px=noise_px, fresh=at_rest.fresh):
+        views = _view_errors(calibration, at_rest)
+        told_of = (one.finding for one in views if any(view.disagrees for view in views))
+        return Finding("refuted", REFUSES, others=(fault, *told_of))
     images = at_known_markers(calibration, marker, at_rest.s)
     mm = resting_error_mm(calibration, at_rest.q, at_rest.face, lengths, images)
     return Finding("agrees", NOTE, amount=math.nan if mm is None else 1e-3 * mm, unit="m")
 
 
-def with_refit(
+def _view_errors(calibration: Calibration, at_rest: RobotAtRest) -> list[ViewError]:
+    """How far the images of each view are off that are seen at all."""
+    look = Observation.of_one(at_rest.shown.marker, at_rest.q, at_rest.s, calibration.view)
+    return [one for one in view_errors(calibration, look) if np.isfinite(one.off_px)]
+
+
+def mended_by_refit(
     finding: Finding, calibration: Calibration, at_rest: RobotAtRest, image_size: ImageSize | None
-) -> tuple[Finding, tuple[str, RefitPoses] | None]:
-    """Add to a fault how far each view is off; where one camera alone is, poses to fit it again from."""
-    if finding.severity != REFUSES or len(at_rest.s) != len(calibration.view):
-        return finding, None
-    marker = np.array(at_rest.marker, dtype=np.int64)
-    look = Observation(np.zeros(1, np.int64), marker, at_rest.q[None], at_rest.s[None], view=calibration.view)
-    views = [one for one in view_errors(calibration, look) if np.isfinite(one.off_px)]
-    finding = replace(finding, others=(*finding.others, *(one.finding for one in views)))
+) -> tuple[tuple[Finding, ...], tuple[str, RefitPoses] | None]:
+    """Where one camera alone is off, poses to fit it again from; nothing else."""
+    views = _view_errors(calibration, at_rest) if finding.severity == REFUSES else []
     moved = [one.view for one in views if one.disagrees]
     # A joint that slipped, a tag that moved and exchanged cameras show in other views too, if there are any.
     if len(moved) != 1 or len(views) < len(calibration.view):
-        return finding, None
-    size = image_size or [view.frame.grey.shape[::-1] for view in at_rest.views] or None
-    corners = image_corners(image_sizes(size, calibration.view))
+        return (), None
+    corners = image_corners(image_sizes(image_size or at_rest.frame_sizes, calibration.view))
     low = calibration.joint_min
     region, v = Region(low, low + calibration.excitation, corners), calibration.view.index(moved[0])
     try:
         poses = refit_poses(calibration, v, region, np.random.default_rng(0))
     except WorkFailed:
-        return finding, None
-    subject = replace(finding.subject, views=(moved[0],), poses=tuple(range(1, len(poses.q) + 1)))
-    again = replace(
-        finding, code="refuted_camera", subject=subject, amount=poses.error_px, limit=poses.before_px
-    )
-    return replace(again, unit="px"), (moved[0], poses)
+        return (), None
+    of = Subject(views=(moved[0],), poses=tuple(range(1, len(poses.q) + 1)))
+    mend = Finding("refit_poses", LIMITS, of, poses.error_px, limit=poses.before_px, unit="px")
+    return (mend,), (moved[0], poses)

@@ -18,7 +18,7 @@ from projservo_cli.geometry.lens import undistort
 from projservo_cli.image_size import image_sizes
 from projservo_cli.loop.rehearsal import begin
 from projservo_cli.monitoring.accuracy import RigidFit, metric_points, rigid_fit
-from projservo_cli.monitoring.image_monitor import detected_fault
+from projservo_cli.monitoring.at_rest import fault_at_rest
 from projservo_cli.planning.constraints import constraints_of
 from projservo_cli.planning.goal_sets import MET_PX, goals_meeting
 from projservo_cli.planning.margins import Demands, Motion, Reaching, best_views
@@ -30,6 +30,7 @@ from projservo_cli.records import (
     InputError,
     JointLimits,
     Model,
+    Observation,
     Plan,
     WorkFailed,
     in_sense,
@@ -233,8 +234,8 @@ def _require_taught_since(scenario: Scenario, calibration: Calibration) -> None:
     numbers, seen = np.array([*pixels]), np.swapaxes(np.array([*pixels.values()]), 0, 1)
     if images.joints is not None:
         q = images.joints.values(calibration.joint_types)
-        if fault := detected_fault(calibration, q, numbers, seen, size):
-            raise failed([fault], setup_of(calibration), "; teach it again", stage=_CHANGED)
+        if fault := fault_at_rest(calibration, Observation.of_one(numbers, q, seen, view), size):
+            raise failed([fault], setup_of(calibration), "; teach it again", stage=CHANGED)
         _require_rigid(rigid_fit(calibration, q, *whole), setup_of(calibration), "teach it again")
         return
     stated = images.sigma_px(scenario.numbers[: scenario.m], scenario.inputs.face)
@@ -255,8 +256,9 @@ def _require_taught_since(scenario: Scenario, calibration: Calibration) -> None:
     if alone[v, k] > near_px:
         of = Subject(views=(calibration.view[v],), markers=(int(calibration.marker[k]),))
         raise failed([Finding("goal_marker_off", REFUSES, of, alone[v, k], limit=near_px, unit="px")])
-    if enough and (fault := detected_fault(calibration, q, numbers, seen, size, sigma)):
-        raise failed([fault], setup_of(calibration), f"; {advice}", stage=_CHANGED)
+    whole_tool = Observation.of_one(numbers, q, seen, view)
+    if enough and (fault := fault_at_rest(calibration, whole_tool, size, sigma_px=sigma)):
+        raise failed([fault], setup_of(calibration), f"; {advice}", stage=CHANGED)
     if not enough and not fit.reached:
         units = ["m" if kind == "P" else "rad" for kind in calibration.joint_types]
         there = [Finding("joint_reading", amount=x, unit=unit) for x, unit in zip(q, units, strict=True)]
@@ -265,7 +267,7 @@ def _require_taught_since(scenario: Scenario, calibration: Calibration) -> None:
         raise failed([Finding("goal_unreached", REFUSES, amount=fit.moved_px, unit="px", others=others)])
 
 
-_CHANGED = "the goal was taught after a change since the calibration"
+CHANGED = "the goal was taught after a change since the calibration"
 
 
 def _require_rigid(fit: RigidFit, setup: Setup, advice: str) -> None:

@@ -188,6 +188,7 @@ class PreflightInputs:
     lengths: FloatArray  # (f, f) distances between these, m; NaN if unknown
     dictionary: str | None  # of the tags; None if not configured
     mount: str  # of the cameras, world or tool
+    noise_px: float  # of the images of a run, with the factor of its test
     board: Board | None = None  # whose corners are the markers; None for tags
 
 

@@ -9,14 +9,25 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from projservo_cli import words
+from projservo_cli.calibration.checks.validation import of_views
 from projservo_cli.calibration.prediction import predict
 from projservo_cli.display import require_radians
 from projservo_cli.findings import LIMITS, REFUSES, Finding, Subject
 from projservo_cli.hardware.checks_at_rest import MIN_SHARED
-from projservo_cli.records import Calibration, FloatArray, InputError, IntArray, WorkFailed
+from projservo_cli.image_size import image_sizes
+from projservo_cli.monitoring.at_rest import fault_at_rest
+from projservo_cli.records import (
+    BoolArray,
+    Calibration,
+    FloatArray,
+    InputError,
+    IntArray,
+    Observation,
+    WorkFailed,
+)
 from projservo_cli.robots.contract import Bounds, PluginRobot, Reading, at_rest_after
 from projservo_cli.robots.settings import Joints
-from projservo_cli.robots.standstill import seen_at_rest
+from projservo_cli.robots.standstill import frames_of, seen_at_rest
 from projservo_cli.settings.sections import JointVector
 from projservo_cli.settings.task import Goal, GoalImages, TaskSettings, sigma_key
 from projservo_cli.simulation.faults import FaultyRobot, SimulatedRobot, robot_by_itself
@@ -47,6 +58,7 @@ class _Taught:
     frames: IntArray  # (V,) how many there were of each view
     moved: FloatArray | None  # (n,) by how much joints moved when they were held again; None if never
     bounds: Bounds  # of the robot, with the units of its joints
+    seen: tuple[Observation, BoolArray]  # frames that they are the mean of, and which are new (K, V)
 
     objects: dict[str, "_Taught"] = field(default_factory=dict)  # objects that it saw, by their names
 
@@ -134,7 +146,7 @@ def teach(
             robot.by_hand("hold")
         if wait is not None:
             wait("take your hands away")
-        rest, mean, sigma, count = seen_at_rest(robot, observe, frames, inputs.settle_s, "teach")
+        rest, mean, sigma, count, looks = seen_at_rest(robot, observe, frames, inputs.settle_s, "teach")
         stood = rest.q if moved is None else moved
         code = "moved_in_images" if moved is None else "moved_since_held"
         _require_still(robot.bounds, stood, robot.read().q, code)
@@ -147,6 +159,7 @@ def teach(
         frames=count.max(axis=1),
         moved=None if moved is None else mean.q - moved,
         bounds=robot.bounds,
+        seen=frames_of(looks, np.array(inputs.numbers, dtype=np.int64)),
     )
     begin, objects = len(inputs.numbers), dict[str, _Taught]()
     for name, numbers in inputs.objects:
@@ -249,7 +262,13 @@ def checked(inputs: PlanInputs, calibration: Calibration, taught: _Taught) -> _C
         displaced=None,
         trajectory=inputs.trajectory.model_copy(update={"profile": profile, "keep_out": ()}),
     )
+    frames, fresh = taught.seen
+    frames, fresh = of_views(frames, calibration.view), fresh[:, views]
+    size, noise_px = image_sizes(inputs.image_size, calibration.view), inputs.noise_px
     try:
+        if fault := fault_at_rest(calibration, frames, size, sigma_px=noise_px, fresh=fresh):
+            setup = words.setup_of(calibration)
+            raise words.failed([fault], setup, "; teach it again", stage=planning.CHANGED)
         plan = planning.run(asked, calibration)
         reached, reason, found = plan.feasible, plan.reason, plan.findings
         q = plan.q[-1] if reached else taught.q

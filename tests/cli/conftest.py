@@ -11,7 +11,7 @@ from projservo_cli import cli, outdated
 from projservo_cli.calibration.checks import validation
 from projservo_cli.laws import law_and_mode
 from projservo_cli.records import Calibration, Observation, Plan, Report, Trace, WorkFailed
-from projservo_cli.stages import calibrate, plan, report, servo
+from projservo_cli.stages import calibrate, plan, report, servo, validate
 from projservo_cli.stages.stage_inputs import CalibrationInputs, PlanInputs, RefitInputs, ServoInputs, Table
 from projservo_cli.store.observation_tables import read_table
 from tests.fake_records import fake
@@ -155,7 +155,7 @@ def statistics(monkeypatch):
     def found(*_):
         return value | {"findings": [*validation.contradictions(value)]}
 
-    monkeypatch.setattr(validation, "residual_statistics", found)
+    monkeypatch.setattr(validate, "compared", found)
     return value
 
 

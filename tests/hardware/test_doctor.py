@@ -17,9 +17,11 @@ from projservo_cli.config import load_config
 from projservo_cli.config.inputs import calibration_inputs
 from projservo_cli.files import working_in
 from projservo_cli.findings import NOTE, REFUSES, Finding, Subject, first
+from projservo_cli.hardware.checks_at_rest import RobotAtRest
+from projservo_cli.records import JointLimits, Observation
 from projservo_cli.report.live_page import LivePage
 from projservo_cli.stages import calibrate
-from projservo_cli.stages.doctor import Checked, calibration_finding, with_refit
+from projservo_cli.stages.doctor import Checked, calibration_finding, mended_by_refit
 from projservo_cli.store.run_file import load
 from projservo_cli.words import line
 from tests.conftest import ROOT
@@ -191,8 +193,7 @@ def calibrated():
 def test_a_calibrated_run_tells_what_changed_since(calibrated, change, words):
     q = calibrated.q_reference
     s = change(predict(calibrated, q[None])[0])
-    known = {"marker": calibrated.marker.tolist(), "face": (0, 1, 2, 3), "views": ()}
-    seen = SimpleNamespace(q=q, s=s, **known)
+    seen = standing(calibrated, q, s)
     side, diagonal = 0.04, 0.04 * np.sqrt(2.0)
     lengths = np.array([[0.0, side, diagonal, side], [side, 0.0, side, diagonal]])
     lengths = np.concatenate([lengths, np.roll(lengths, 2, axis=1)])
@@ -213,10 +214,10 @@ def test_a_camera_that_moved_is_named_with_the_poses_that_mend_it(calibrated, vi
     off[1] = np.radians(3.0 * slipped)
     s = predict(calibrated, (q + off)[None])[0]
     s[1] += 0.0 if slipped else 12.0
-    seen = SimpleNamespace(q=q, s=s, marker=calibrated.marker.tolist(), face=(0, 1, 2, 3), views=())
+    seen = standing(calibrated, q, s)
     fault = calibration_finding(calibrated, seen, (640, 480), np.full((4, 4), np.nan))
-    finding, mend = with_refit(fault, calibrated, seen, (640, 480))
-    fault, *views = finding.others
+    found, mend = mended_by_refit(fault, calibrated, seen, (640, 480))
+    fault, *views = fault.others
     assert fault.code == "images_off"
     assert [one.subject.views for one in views] == [(name,) for name in calibrated.view]
     assert (mend is None) == slipped
@@ -225,8 +226,17 @@ def test_a_camera_that_moved_is_named_with_the_poses_that_mend_it(calibrated, vi
         assert view == "right"
         off = views[1]
         assert (off.amount, off.limit < 1.0) == (pytest.approx(17.0, abs=0.5), True)
-        assert f"put the right camera back, or fit it again from {len(poses.q)} poses" in line(finding)
+        assert f"put the right camera back, or fit it again from {len(poses.q)} poses" in line(found[0])
         assert poses.before_px < poses.error_px <= 1.5 * poses.before_px
+
+
+def standing(calibrated, q, s):
+    """An arm at rest at joints before images (V, m, 2)."""
+    shown = Observation.of_one(calibrated.marker, q, s, calibrated.view)
+    numbers, seen, joints = calibrated.marker.tolist(), np.isfinite(s[..., 0]), JointLimits(q, q, q, q)
+    return RobotAtRest(
+        numbers, (0, 1, 2, 3), q, s, None, 0.0 * seen, shown, np.ones((1, len(s)), bool), joints, ()
+    )
 
 
 def _with_noise(s, px):

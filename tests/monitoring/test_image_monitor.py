@@ -15,9 +15,11 @@ from projservo_cli.calibration.prediction import (
 from projservo_cli.geometry.displacements import displacements
 from projservo_cli.monitoring import innovation_tests
 from projservo_cli.monitoring.accuracy import Posture
+from projservo_cli.monitoring.at_rest import fault_at_rest
 from projservo_cli.monitoring.frame_pairs import FramePair
-from projservo_cli.monitoring.image_monitor import ImageMonitor, detected_fault
+from projservo_cli.monitoring.image_monitor import ImageMonitor
 from projservo_cli.monitoring.innovation_tests import WINDOW, Detector, ErrorModel
+from projservo_cli.records import Observation
 from tests.calibration.simulated_robot import random_robot, trials
 from tests.configured import calibrate, truth_of
 from tests.known import configured
@@ -311,7 +313,7 @@ def test_a_tag_that_is_off_by_less_than_a_pixel_in_one_posture_is_no_fault(
     for tag in tags:
         s[:, 4 * tag : 4 * tag + 4] += off * np.array(BENT_TAG)
     s[0] += shift
-    fault = detected_fault(sharp, q, sharp.marker, s, arm.image_size)
+    fault = fault_at_rest(sharp, Observation.of_one(sharp.marker, q, s, sharp.view), arm.image_size)
     named = None if fault is None else fault.others[0] if fault.others else fault
     assert (named and named.code) == changed
 

@@ -10,9 +10,11 @@ from scipy.linalg import expm
 from projservo_cli.calibration import calibrate, prediction
 from projservo_cli.monitoring import innovation_tests
 from projservo_cli.monitoring.accuracy import Posture, resting_error_mm, rigid_fit
+from projservo_cli.monitoring.at_rest import fault_at_rest
 from projservo_cli.monitoring.frame_pairs import FramePair, Pairing, TimedImage
 from projservo_cli.monitoring.hypotheses import Evidence, causes_of
-from projservo_cli.monitoring.image_monitor import ImageMonitor, detected_fault
+from projservo_cli.monitoring.image_monitor import ImageMonitor
+from projservo_cli.records import Observation
 from tests.calibration.simulated_robot import around, random_robot, revolute, trials
 from tests.calibration.test_cameras_on_the_tool import Hand
 from tests.monitoring.test_image_monitor import LOOKS, PERIOD, Arm, causes, first_alarm, look, noisy
@@ -112,10 +114,14 @@ def change(case, **parts):
     return dataclasses.replace(case.robot, **parts).images(case.q) - case.robot.images(case.q)
 
 
+def at_end(case, s):
+    """Images (k, V, m, 2) where the arm stands at last."""
+    return Observation.of_one(case.calibration.marker, case.q[-1], s[-1], case.views)
+
+
 def test_what_moved_is_told_by_the_mount_and_in_one_posture_what_is_alike(case):
     by = np.zeros((4, 4))
     by[:3, :3], by[:3, 3] = np.cross([0.02, -0.03, 0.02], np.eye(3)).T, (0.006, 0.008, -0.006)
-    numbers = case.calibration.marker
     body, rig = "displaced_tool", "displaced_camera" if case.one else "displaced_rig"
     moved = {"markers": case.robot.markers @ expm(by).T}, {"cameras": case.robot.cameras @ expm(by)}
     for parts, name, other in zip(moved, (body, rig), (rig, body), strict=True):
@@ -123,7 +129,7 @@ def test_what_moved_is_told_by_the_mount_and_in_one_posture_what_is_alike(case):
         found = case.said(case.q, case.s + off * (np.arange(40) >= ONSET).reshape(-1, 1, 1, 1))[1]
         assert name in found
         assert other not in found
-        at_rest = detected_fault(case.calibration, case.q[-1], numbers, (case.s + off)[-1], None)
+        at_rest = fault_at_rest(case.calibration, at_end(case, case.s + off))
         assert {name, other} <= {*causes(at_rest)}
 
 
@@ -131,11 +137,10 @@ def test_a_marker_that_moves_is_named_and_by_one_camera_that_it_may_be_covered(c
     by = np.zeros_like(case.robot.markers)
     by[3, :3] = 0.02, -0.015, 0.01
     s = case.s + change(case, markers=case.robot.markers + by) * (np.arange(40) >= ONSET).reshape(-1, 1, 1, 1)
-    numbers = case.calibration.marker
-    at_rest = detected_fault(case.calibration, case.q[-1], numbers, s[-1], None)
+    at_rest = fault_at_rest(case.calibration, at_end(case, s))
     for found in (case.said(case.q, s)[1], causes(at_rest)):
         assert found["displaced_markers"].subject.markers == (14,)
-    assert detected_fault(case.calibration, case.q[-1], numbers, case.s[-1], None) is None
+    assert fault_at_rest(case.calibration, at_end(case, case.s)) is None
 
 
 def test_cameras_that_are_exchanged_are_named(case):

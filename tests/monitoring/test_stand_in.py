@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from projservo_cli.monitoring.image_monitor import detected_fault
+from projservo_cli.monitoring.at_rest import fault_at_rest
+from projservo_cli.records import Observation
 from tests.monitoring.stand_in import IMAGE, StandIn
 from tests.studies.monitoring import Rig, calibrated, driven, tasks
 
@@ -39,5 +40,6 @@ def test_tags_that_are_bent_in_one_posture_are_no_fault_and_hide_no_camera(bent,
     for tag in bent:
         s[:, 4 * tag : 4 * tag + 4] += by * _BENT
     s[0] += shift
-    fault = detected_fault(calibrated(rig), q, np.arange(20), s, size)
+    known = calibrated(rig)
+    fault = fault_at_rest(known, Observation.of_one(np.arange(20), q, s, known.view), size)
     assert (fault and (fault.others or (fault,))[0].code) == named

@@ -13,11 +13,11 @@ from contextlib import suppress
 
 import numpy as np
 
-from projservo_cli.calibration.checks.validation import residual_statistics
 from projservo_cli.config import inputs as given
 from projservo_cli.findings import REFUSES
 from projservo_cli.records import Observation, WorkFailed
 from projservo_cli.stages import doctor, teach
+from projservo_cli.stages.validate import compared
 from tests.configured import checked, plan, servo
 from tests.monitoring.stand_in import ARMS, FPS, StandIn, seen, tool_pose
 from tests.studies.common import in_two_processes, parser_of, rate, written
@@ -90,12 +90,14 @@ def asked(command, config, calibration):
     """Codes of what a command finds."""
     if command == "validate":
         robot = Standing(**config.plant.options)
-        q, images = zip(*(robot.read()[:2] for _ in range(FRAMES)), strict=True)
-        shown = Observation(np.arange(FRAMES), np.arange(20), np.array(q), np.array(images))
-        return causes(residual_statistics(calibration, shown)["findings"])
+        q, images, *more = zip(*(robot.read() for _ in range(FRAMES)), strict=True)
+        sigma = np.array(more[-1]) if more else None
+        shown = Observation(np.arange(FRAMES), np.arange(20), np.array(q), np.array(images), sigma=sigma)
+        return causes(compared(calibration, shown)["findings"])
     try:
         if command == "doctor":
-            found = doctor.check(given.preflight_inputs(config), calibration).findings
+            told = doctor.check(given.preflight_inputs(config), calibration).findings
+            found = [one for one in told if one.code == "refuted"]  # joints beyond limits are said beside it
         elif command == "teach":
             taught = teach.teach(given.teach_inputs(config), FRAMES)
             found = checked(config, calibration, taught).findings

@@ -302,12 +302,8 @@ def residual_statistics(calibration: Calibration, observation: Observation) -> d
     ``findings``, on these and on medians beyond their limits.
     Raises InputError if the readings have another number of joints or are not finite.
     """
-    observation = of_views(observation.at_rest, calibration.view)
-    images, told = without_placeholders(observation.images, observation.marker)
-    observation = replace(observation, images=images)
-    board = BoardNumbering.of(observation)
-    board.turn_by(calibration)
-    observation, told = board.observation, (*told, *board.findings)
+    observation, told = comparable(calibration, observation)
+    images = observation.images
     known = np.isin(observation.marker, calibration.marker)
     numbers = calibration.marker.tolist()
     order = [numbers.index(number) for number in observation.marker[known].tolist()]
@@ -351,6 +347,18 @@ def residual_statistics(calibration: Calibration, observation: Observation) -> d
         "advice": list(lines(told, setup_of(calibration))),
     }
     return found | {"findings": [*told, *contradictions(found)]}
+
+
+def comparable(calibration: Calibration, observation: Observation) -> tuple[Observation, tuple[Finding, ...]]:
+    """Return images at rest of the views of a calibration, boards turned as there, and findings on them.
+
+    Raises InputError if a view is missing.
+    """
+    observation = of_views(observation.at_rest, calibration.view)
+    images, told = without_placeholders(observation.images, observation.marker)
+    board = BoardNumbering.of(replace(observation, images=images))
+    board.turn_by(calibration)
+    return board.observation, (*told, *board.findings)
 
 
 def median_limit(found: Mapping[str, Any]) -> Finding:

@@ -1,0 +1,44 @@
+"""Validate: further images against a calibration, by their residuals, and what they show to have changed."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from projservo_cli.calibration.checks.validation import comparable, residual_statistics
+from projservo_cli.calibration.detections import SAME_READING, even_choice
+from projservo_cli.findings import LIMITS
+from projservo_cli.image_size import ImageSize, image_sizes
+from projservo_cli.monitoring.at_rest import fault_at_rest
+from projservo_cli.records import Calibration, Observation
+from projservo_cli.words import lines, setup_of
+
+# Frames, at most, by which what changed is told.
+_MOST_TOLD = 300
+
+
+def compared(
+    calibration: Calibration, observation: Observation, image_size: ImageSize | None = None
+) -> dict[str, Any]:
+    """Return statistics of residuals as ``residual_statistics``, with what changed since the calibration.
+
+    Frames of one posture show that as they do to ``doctor``. Of several postures the medians decide, as
+    some images of a recording may be off: what changed is told beside them.
+
+    Raises InputError as ``residual_statistics``.
+    """
+    value = residual_statistics(calibration, observation)
+    seen, told = comparable(calibration, observation)
+    seen = seen.rows(np.isin(np.arange(len(seen.q)), even_choice(len(seen.q), _MOST_TOLD)))
+    size, noise_px = image_sizes(image_size, calibration.view), calibration.sigma_fitted_px
+    if not value["count"]:
+        return value
+    fault = fault_at_rest(calibration, seen, size, sigma_px=noise_px)
+    if (np.ptp(seen.q, axis=0) <= SAME_READING).all():
+        return value | {"findings": [*told, *([fault] if fault else ())]}
+    changed = [replace(fault, severity=LIMITS)] if fault else []
+    advice = (f"at some poses {text}" for text in lines(changed, setup_of(calibration)))
+    return value | {
+        "findings": [*value["findings"], *changed],
+        "advice": [*value["advice"], *advice],
+    }
