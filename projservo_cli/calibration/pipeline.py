@@ -64,6 +64,7 @@ from projservo_cli.image_size import ImageSize, border_distance, image_sizes
 from projservo_cli.records import (
     FROM_ONE,
     TOOL,
+    WHY_LOST,
     WORLD,
     Calibration,
     Errors,
@@ -191,7 +192,7 @@ def calibrate(
     with threadpool_limits(limits=1):
         whole = Detections.of(observation, joint_types, mount)
         still = standing(whole)
-        of_still = [standing_markers(whole, still)] if still.any() else []
+        of_still, numbers = [standing_markers(whole, still)] if still.any() else [], whole.marker[still]
         whole = whole.of_markers(~still)
         require_motion(whole)
         require_no_copies(whole)
@@ -219,7 +220,11 @@ def calibrate(
             limit = MAX_PREDICTED * float(frame.size.max()) if max_predicted_px is None else max_predicted_px
             asked = lens, init, curves
             solution, expected, result = _maximum_likelihood(search, whole, frame, expect, asked, limit)
-        result = with_findings(result, of_still) if of_still else result
+        if of_still:
+            standing_too = np.column_stack([numbers, np.full(len(numbers), WHY_LOST.index("still"))])
+            known = standing_too[:0] if result.rejected_markers is None else result.rejected_markers
+            lost = np.concatenate([known, standing_too])
+            result = dataclasses.replace(with_findings(result, of_still), rejected_markers=lost)
         seconds = time.perf_counter() - begin
         if solution is not None and fitted is not None:
             fitted(solution, expected.noise_px(solution))

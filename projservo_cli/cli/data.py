@@ -341,8 +341,9 @@ def _validate(
 
     Compares the pixels of an observation table (--data) with those the calibration of a run predicts at the
     table's joint readings. Ends in exit code 1 where their median distance passes three times the stated
-    error and the noise of the images together, or where that of one camera shows that it was moved. A table of
-    one posture is judged as doctor judges an arm at rest; of several, what changed is told beside the medians.
+    error and the noise of the images together, or where that of one camera shows that it was moved. A table
+    of one posture is judged as doctor judges an arm at rest; of several, what changed is told beside the
+    medians.
 
     With --metric it compares positions that another instrument measured, such as a laser tracker. Its scale,
     its pose and the place of its point on the tool are fitted to --fit.

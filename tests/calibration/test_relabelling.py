@@ -111,6 +111,7 @@ def test_a_marker_that_moves_in_its_own_way_is_named_and_left_out(code):
     assert named[0].subject.markers == (number,)
     assert found.usable
     assert number not in found.marker
+    assert number in found.rejected_markers[:, 0]
 
 
 def test_sound_tables_blame_no_row():
@@ -206,3 +207,13 @@ def test_joints_that_err_by_more_than_trials_show_are_not_in_another_order():
         robot.observe(q + np.radians(5.0) * wave[:, None] * np.eye(3)[2], SIGMA, rng), q=q
     )
     assert refused(seen).code == "several_joints"
+
+
+def test_a_pose_at_which_all_cameras_are_off_alike_is_of_the_arm():
+    robot, q, rng = recorded(13)
+    true = q.copy()
+    true[18] += np.radians([0.4, -0.3, 0.3])
+    seen = dataclasses.replace(robot.observe(true, SIGMA, rng), q=q)
+    found = calibrate(seen, TYPES, source="recorded")
+    assert not [one for one in found.findings if one.code in ("moved_camera", "unsettled_camera")]
+    assert not found.moved_images.size

@@ -118,9 +118,24 @@ def _moved_images(solution: Solution, out: BoolArray) -> IntArray:
         small = np.abs(fit.x).max() <= _SMALL_MOTION * radius
         if median <= _CORRECTED * RAYLEIGH * sigma and (alone or small):
             found.append((int(k), view))
+    found = _of_cameras(detections, found)
     for view in {view for _, view in found}:
         found += [(k, view) for k in _settling(detections, residual[view], out[view], view, found)]
     return np.array([*dict.fromkeys(found)], dtype=np.int64).reshape(-1, 2)
+
+
+def _of_cameras(detections: Detections, moved: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Images that moved, poses and views, without those of poses at which all cameras did: the arm did.
+
+    Over the first poses all cameras may settle.
+    """
+    poses, views = np.unique(detections.pose_of).tolist(), dict[int, set[int]]()
+    for k, view in moved:
+        views.setdefault(k, set()).add(view)
+    settling = next((i for i, k in enumerate(poses) if k not in views), len(poses))
+    seen = {k: np.flatnonzero((detections.seen & (detections.pose_of == k)).any(axis=1)) for k in views}
+    at_arm = {k for k in views if 1 < len(seen[k]) == len(views[k]) and k not in poses[:settling]}
+    return [(k, view) for k, view in moved if k not in at_arm]
 
 
 def _settling(
