@@ -34,7 +34,8 @@ def fault_at_rest(
     """
     if not calibration.usable or not calibration.has_covariance:
         return None
-    shown, sigma_px = _of_known_markers(calibration, shown), max(calibration.sigma_px, sigma_px)
+    shown = _of_known_markers(calibration, shown)
+    sigma_px = max(calibration.sigma_px, calibration.sigma_fitted_px, sigma_px)
     if len(shown.q) == 1:
         return _fault_of_one(calibration, shown, image_size, sigma_px)
     monitor = _monitor_after(calibration, shown, image_size, sigma_px, fresh)

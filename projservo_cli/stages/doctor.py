@@ -181,7 +181,6 @@ def calibration_finding(
     marker = at_rest.shown.marker
     if not np.isfinite(at_rest.s[:, np.isin(marker, calibration.marker)]).any():
         return Finding("uncompared", LIMITS)
-    noise_px = max(noise_px, calibration.sigma_fitted_px)
     if fault := fault_at_rest(calibration, at_rest.shown, size, sigma_px=noise_px, fresh=at_rest.fresh):
         views = _view_errors(calibration, at_rest)
         told_of = (one.finding for one in views if any(view.disagrees for view in views))

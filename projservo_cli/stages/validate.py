@@ -30,10 +30,9 @@ def compared(
     value = residual_statistics(calibration, observation)
     seen, told = comparable(calibration, observation)
     seen = seen.rows(np.isin(np.arange(len(seen.q)), even_choice(len(seen.q), _MOST_TOLD)))
-    size, noise_px = image_sizes(image_size, calibration.view), calibration.sigma_fitted_px
     if not value["count"]:
         return value
-    fault = fault_at_rest(calibration, seen, size, sigma_px=noise_px)
+    fault = fault_at_rest(calibration, seen, image_sizes(image_size, calibration.view))
     if (np.ptp(seen.q, axis=0) <= SAME_READING).all():
         return value | {"findings": [*told, *([fault] if fault else ())]}
     changed = [replace(fault, severity=LIMITS)] if fault else []

@@ -308,7 +308,8 @@ def test_a_tag_that_is_off_by_less_than_a_pixel_in_one_posture_is_no_fault(
     arm, seed, tags, off, shift, changed
 ):
     """One view does not tell a slanted tag from one that moved by as little, which hides no moved camera."""
-    sharp, q = dataclasses.replace(arm.calibration, sigma_px=0.1), arm.way(seed)[0][-1]
+    sharp = dataclasses.replace(arm.calibration, sigma_px=0.1, sigma_fitted_px=0.1)
+    q = arm.way(seed)[0][-1]
     s = noisy(arm.images(at_once(q[None])), seed, 0.1)[0]
     for tag in tags:
         s[:, 4 * tag : 4 * tag + 4] += off * np.array(BENT_TAG)
