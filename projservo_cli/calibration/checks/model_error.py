@@ -59,6 +59,8 @@ _MAX_TAGS = 4
 _MIN_CORNERS = 2
 # Maximum leverage of the images of a posture, whose residuals say nothing beyond.
 _MAX_LEVERAGE = 0.999
+# Maximum number of terms of the root of leverages as a series, and their share at which it ends.
+_TERMS, _ROUNDING = 60, 1e-14
 # Maximum share of the squares of what images are off that a step leaves which is named.
 _UNEXPLAINED = 0.2
 # Effect over the stated error from which a nuisance that the data could not have shown is named.
@@ -303,7 +305,7 @@ class _Tests:
         counted = counted[np.argsort(pose_of[counted], kind="stable")]
         self.poses, starts = np.unique(pose_of[counted], return_index=True)
         self.edges = np.append(starts, counted.size)
-        self.nuisances, self.dof = nuisances, max(solution.dof, 1)
+        self.dof = max(solution.dof, 1)
         self.detections = problem.detections
         # Weights of residuals in each view, and in the last entry in all: those of two views are near one.
         weights = [problem.detections.weight[v, u] for v, u in enumerate(used)]
@@ -320,25 +322,52 @@ class _Tests:
         self.U = whitened(problem.dense(problem.derivative(params), used)) @ self.F
         r = -whitened(solution.raw.reshape(-1, 1))[:, 0]
         self.r = self.r_first = r - self.U @ (self.U.T @ r)
-        flat = [one.columns * used[..., None, None] for one in nuisances]
-        Z = whitened(np.concatenate(flat, axis=3).reshape(2 * used.size, -1))
         self.parts = np.cumsum([0, *(one.columns.shape[3] for one in nuisances)])
         self.units = list[FloatArray]()
+        self.Z = np.empty((len(r), int(self.parts[-1])))
         for number, one in enumerate(nuisances):
-            own = slice(*self.parts[number : number + 2])
-            self.units.append(_unit(one.kind, Z[:, own]))
-            Z[:, own] @= self.units[-1]
-        self.Z = Z
+            columns = whitened((one.columns * used[..., None, None]).reshape(2 * used.size, -1))
+            self.units.append(_unit(one.kind, columns))
+            self.Z[:, slice(*self.parts[number : number + 2])] = columns @ self.units[-1]
+            if one.timed == _DRIFT:
+                self.Z[:, self.part(number)] *= self._over_rows(_DRIFT, 0)
+        self.nuisances = [one._replace(columns=np.zeros(0)) for one in nuisances]  # as large again
+        self.W = self.U.T @ self.Z  # (p, c)
+        self.steps = [number for number, one in enumerate(nuisances) if one.timed == _STEP]
+        self.grams = self._grams()
         self.Q = np.zeros((len(r), 0))  # orthonormal columns of the nuisances chosen
         self.periods = False  # whether what repeats over a joint is a candidate
 
+    def part(self, number: int) -> slice:
+        """Columns of a nuisance among all."""
+        return slice(*self.parts[number : number + 2].tolist())
+
+    def _over_rows(self, timed: int, onset: int) -> FloatArray:
+        """Amplitudes (L, 1) over the detections of a drift, or of a step at a pose."""
+        return np.repeat(_over_time(timed, len(self.poses), onset), np.diff(self.edges))[:, None]
+
+    def _grams(self) -> list[FloatArray]:
+        """Gram matrices of cleared nuisances, (d, d); of steps at each pose (K - 1, d, d)."""
+        parts = [self.part(number) for number in range(len(self.nuisances))]
+        grams = [self.Z[:, at].T @ self.Z[:, at] - self.W[:, at].T @ self.W[:, at] for at in parts]
+        for number in self.steps:
+            grams[number] = np.zeros((max(len(self.poses) - 1, 0), *grams[number].shape))
+        after = np.zeros_like(self.W)
+        square = [np.zeros((at.stop - at.start,) * 2) for at in parts]
+        which = np.isin(np.repeat(np.arange(len(parts)), np.diff(self.parts)), self.steps)
+        for k in range(len(self.poses) - 1, 0, -1):
+            rows = slice(*self.edges[k : k + 2])
+            after[:, which] += self.U[rows].T @ self.Z[rows][:, which]
+            for number in self.steps:
+                at, Z = parts[number], self.Z[rows, parts[number]]
+                square[number] += Z.T @ Z
+                grams[number][k - 1] = square[number] - after[:, at].T @ after[:, at]
+        return grams
+
     def columns(self, choice: _Choice) -> FloatArray:
         """Columns (L, d) of a nuisance in units of its usual size."""
-        own = self.Z[:, slice(*self.parts[choice.number : choice.number + 2])]
-        timed = self.nuisances[choice.number].timed
-        if timed in (_NO_TIME, _PAST):
-            return own
-        return own * np.repeat(_over_time(timed, len(self.poses), choice.onset), np.diff(self.edges))[:, None]
+        own = self.Z[:, self.part(choice.number)]
+        return own * self._over_rows(_STEP, choice.onset) if choice.number in self.steps else own
 
     def cleared(self, columns: FloatArray) -> FloatArray:
         """Columns (L, d) cleared of the parameters and of the nuisances chosen."""
@@ -372,9 +401,7 @@ class _Tests:
             for number, one in enumerate(self.nuisances)
             if one.timed != _STEP and (self.periods or one.kind != "cyclic")
         ]
-        stack = np.hstack([self.columns(_Choice(number, 0)) for number in plain])
-        s, W = stack.T @ self.r, np.vstack([self.U.T @ stack, self.Q.T @ stack])
-        edges = np.cumsum([0, *(self.units[number].shape[0] for number in plain)])
+        s, W = self.Z.T @ self.r, self.Q.T @ self.Z
         found = []
 
         def judge(gain: float, choice: _Choice, onsets: int) -> None:
@@ -386,9 +413,10 @@ class _Tests:
             if criterion < 0.0:
                 found.append((float(criterion), choice, gain))
 
-        for number, a, b in zip(plain, edges[:-1], edges[1:], strict=True):
-            gram = stack[:, a:b].T @ stack[:, a:b] - W[:, a:b].T @ W[:, a:b]
-            judge(float(self._gain(gram, s[a:b])), _Choice(number, 0), 1)
+        for number in plain:
+            at = self.part(number)
+            gram = self.grams[number] - W[:, at].T @ W[:, at]
+            judge(float(self._gain(gram, s[at])), _Choice(number, 0), 1)
         for number, gains in self._step_gains() if K > 2 else ():
             onset = int(np.argmax(gains)) + 1
             judge(float(gains[onset - 1]), _Choice(number, onset), K)
@@ -402,18 +430,18 @@ class _Tests:
 
     def _step_gains(self) -> Iterator[tuple[int, FloatArray]]:
         """Number and gains (K - 1,) of each step, at each pose from the second on."""
-        steps = [number for number, one in enumerate(self.nuisances) if one.timed == _STEP]
-        Z = np.hstack([self.columns(_Choice(number, 0)) for number in steps])
-        first, basis = self.edges[:-1], np.hstack([self.U, self.Q])
-        spans = list(zip(first, self.edges[1:], strict=True))
-        s = np.add.reduceat(Z * self.r[:, None], first, axis=0)
-        A, W = (np.array([part[a:b].T @ Z[a:b] for a, b in spans]) for part in (Z, basis))
-        s, A, W = (np.cumsum(part[::-1], axis=0)[::-1][1:] for part in (s, A, W))
-        end = 0
-        for number in steps:
-            own = slice(end, end := end + len(self.units[number]))
-            gram = A[:, own, own] - W[:, :, own].swapaxes(1, 2) @ W[:, :, own]
-            yield number, self._gain(gram, s[:, own])
+        first = self.edges[:-1]
+
+        def later(rows: FloatArray) -> FloatArray:
+            """Sums (K - 1, …) of rows (L, …) from each pose on, but the first."""
+            return np.asarray(np.cumsum(np.add.reduceat(rows, first, axis=0)[::-1], axis=0)[::-1][1:])
+
+        for number in self.steps:
+            Z, gram = self.Z[:, self.part(number)], self.grams[number]
+            if self.Q.shape[1]:
+                W = later(self.Q[:, :, None] * Z[:, None])
+                gram = gram - W.swapaxes(1, 2) @ W
+            yield number, self._gain(gram, later(Z * self.r[:, None]))
 
     def chance(self, choice: _Choice) -> float:
         """Probability of chance: the larger of the F test and of the Wald test by postures."""
@@ -692,10 +720,14 @@ class _Effects:
 
     def of(self, number: int, Z: FloatArray) -> FloatArray:
         """Changes (rows, d) at the end of the recording by a nuisance of columns (L, d) in the data."""
+        return self._moved(number, self.T @ (self.tests.U.T @ Z))
+
+    def _moved(self, number: int, absorbed: FloatArray) -> FloatArray:
+        """The same, of which the fit absorbs a part (rows, d)."""
         one = self.there[number]
         columns = one.columns.reshape(len(self.rows), -1)[self.rows] @ self.tests.units[number]
         share = {_DRIFT: 0.5, _PAST: 0.0}.get(one.timed, 1.0)  # at rest, images are of nothing before
-        return np.asarray(share * columns - self.T @ (self.tests.U.T @ Z))
+        return np.asarray(share * columns - absorbed)
 
     def rms(self, change: FloatArray) -> float:
         """Root mean square per marker and view of a change (rows,)."""
@@ -704,15 +736,14 @@ class _Effects:
     def unshown(self, found: set[int], sigma_px: float) -> Finding | None:
         """Nuisance that has the largest effect of those too small for the tests and no larger than usual."""
         worst: tuple[float, int, FloatArray] | None = None
+        absorbed = self.T @ self.tests.W
         for number, one in enumerate(self.tests.nuisances):
             if number in found or one.timed != _NO_TIME or (one.kind == "scale" and len(one.joints) > 1):
                 continue
-            Z = self.tests.columns(_Choice(number, 0))
-            W = self.tests.U.T @ Z
-            information = (Z.T @ Z - W.T @ W) / (_DETECTED * sigma_px) ** 2
-            values, basis = np.linalg.eigh(information)
+            values, basis = np.linalg.eigh(self.tests.grams[number] / (_DETECTED * sigma_px) ** 2)
             root = basis / np.sqrt(1.0 + np.maximum(values, 0.0))
-            _, s, Vt = np.linalg.svd(self.of(number, Z) @ root, full_matrices=False)
+            moved = self._moved(number, absorbed[:, self.tests.part(number)])
+            _, s, Vt = np.linalg.svd(moved @ root, full_matrices=False)
             if worst is None or s[0] > worst[0]:
                 worst = float(s[0]), number, root @ Vt[0]
         if worst is None:
@@ -762,14 +793,24 @@ def _design(tests: _Tests, r: FloatArray, T: FloatArray, sigma_px: float) -> flo
     regression with multi-stage samples", Survey Methodology 28, 2002). One where it is not significant.
     """
     groups, root = np.repeat(tests.posture, np.diff(tests.edges)), np.linalg.qr(T, mode="r")
-    shown, expected = [], []
-    for posture in range(int(groups.max()) + 1):
-        rows = groups == posture
-        leverage, P = np.linalg.eigh(tests.U[rows] @ tests.U[rows].T)
-        adjusted = P @ (P.T @ r[rows] / np.sqrt(1.0 - np.minimum(leverage, _MAX_LEVERAGE)))
-        moved = root @ tests.U[rows].T
-        shown.append(float(np.square(moved @ adjusted).sum()))
-        expected.append(sigma_px**2 * float(np.square(moved).sum()))
+    order, count = np.argsort(groups, kind="stable"), int(groups.max()) + 1
+    ends, shown, expected = np.searchsorted(groups[order], np.arange(count + 1)), [], []
+    for rows in (order[slice(*pair)] for pair in pairwise(ends.tolist())):
+        U = tests.U[rows]
+        shown.append(float(np.square(root @ (U.T @ _adjusted(U, r[rows]))).sum()))
+        expected.append(sigma_px**2 * float(np.square(root @ U.T).sum()))
     e = np.array(expected)
     ratio, noise = sum(shown) / max(e.sum(), 1e-300), np.sqrt(2.0 * (e**2).sum()) / max(e.sum(), 1e-300)
     return float(ratio) if ratio > 1.0 + _CORRELATED * noise else 1.0
+
+
+def _adjusted(U: FloatArray, r: FloatArray) -> FloatArray:
+    """Residuals (l,) of a posture for its leverage, (I − U Uᵀ)^-½ r, by a series if it is short."""
+    adjusted, term = r.copy(), r
+    for k in range(1, _TERMS):
+        term = (1.0 - 0.5 / k) * (U @ (U.T @ term))
+        adjusted += term
+        if np.linalg.norm(term) <= _ROUNDING * np.linalg.norm(r):
+            return adjusted
+    leverage, P = np.linalg.eigh(U @ U.T)
+    return np.asarray(P @ (P.T @ r / np.sqrt(1.0 - np.minimum(leverage, _MAX_LEVERAGE))))
