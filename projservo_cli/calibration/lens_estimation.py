@@ -6,7 +6,7 @@ import numpy as np
 from scipy.special import fdtri
 
 from projservo_cli.calibration.bundle_adjustment import LeastSquares
-from projservo_cli.calibration.detections import MAX_JUDGED, Detections
+from projservo_cli.calibration.detections import Detections
 from projservo_cli.calibration.epipolar import Epipolar, ImageFrame, ImageGeometry
 from projservo_cli.calibration.initialization import Search
 from projservo_cli.calibration.prediction import LENS, Parameters
@@ -29,7 +29,7 @@ def share_explained(solution: Solution, frame: ImageFrame) -> float:
     """Share of the squared residuals that a lens would explain; zero with a lens, or if not significant."""
     if solution.params.lens is not None:
         return 0.0
-    few = solution.thinned(MAX_JUDGED)
+    few = solution.judged()
     share = _share(few, dataclasses.replace(few.params, lens=_undistorted(frame)), LENS)
     return share if share >= _MIN_SHARE else 0.0
 
@@ -94,7 +94,7 @@ def fit_lens(solution: Solution, search: Search) -> tuple[Solution, ImageGeometr
     params = dataclasses.replace(solution.params, lens=_undistorted(search.frame))
     found = _fit_terms(solution, params, LENS, search)
     if found is not None:
-        few = found.thinned(MAX_JUDGED)
+        few = found.judged()
         much = found.used.sum() < (1.0 - _MUCH) * solution.problem.detections.seen.sum()
         if much or _share(few, few.params, 2 * LENS) > 0.0:
             freed = _fit_terms(solution, found.params, 2 * LENS, search)

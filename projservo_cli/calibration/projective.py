@@ -58,13 +58,13 @@ class Projective:
         return found
 
     def bias(self, solution: Solution, bias: FloatArray) -> FloatArray:
-        """Errors (p, k) of P, H_hat, lenses and M by those of the parameters, of ``MAX_JUDGED`` markers.
+        """Errors (p, k) of P, H_hat, lenses and M by those of the parameters, of the markers judged.
 
         Markers beyond follow no error of their own.
         """
         m, s = len(self.params.M), solution.problem.shared
         marker = np.zeros((m, 3, bias.shape[1]))
-        marker[even_choice(m, MAX_JUDGED)] = bias[s:].reshape(-1, 3, bias.shape[1])
+        marker[solution.judged_markers] = bias[s:].reshape(-1, 3, bias.shape[1])
         found = self._in_frame(solution, Errors(bias[:s], marker, np.zeros((m, 3, 0))))
         return np.concatenate([found.shared, found.marker.reshape(-1, bias.shape[1])])
 

@@ -49,6 +49,8 @@ OPEN_DIRECTION = 1e-10
 _AT_ONCE = 2**21
 # Maximum number of corners whose squared residuals the record keeps.
 _MAX_CORNERS = 50_000
+# Maximum number of detections by which a fit is assessed, and minimum number of markers.
+_MAX_JUDGED_DETECTIONS, _MIN_JUDGED = 40_000, 8
 # Maximum number of rounds in which inliers are selected.
 _MASK_ROUNDS = 4
 # Share of observations that are wrong above which whole tracks are tested.
@@ -184,6 +186,20 @@ class Solution:
         return (
             self if m <= max_markers else self.of_markers(np.isin(np.arange(m), even_choice(m, max_markers)))
         )
+
+    @property
+    def judged_markers(self) -> IntArray:
+        """Markers by which a fit is assessed, evenly: fewer where they have many detections."""
+        detections = self.problem.detections
+        few = even_choice(detections.marker.size, MAX_JUDGED)
+        count = np.bincount(detections.marker_of, self.used.sum(axis=0), detections.marker.size)[few].sum()
+        most = int(_MAX_JUDGED_DETECTIONS * few.size / max(count, 1.0))
+        return few[even_choice(few.size, max(most, _MIN_JUDGED))]
+
+    def judged(self) -> "Solution":
+        """Select the markers by which a fit is assessed."""
+        m, which = self.problem.detections.marker.size, self.judged_markers
+        return self if which.size == m else self.of_markers(np.isin(np.arange(m), which))
 
     def kept(self) -> "Solution":
         """Solution of the detections that count alone."""

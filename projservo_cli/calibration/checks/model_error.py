@@ -559,13 +559,20 @@ class ModelCheck:
 
 
 def examine(
-    solution: Solution, errors: Errors, there: LeastSquares, inside: BoolArray, T: FloatArray, sigma_px: float
+    solution: Solution,
+    errors: Errors,
+    there: LeastSquares,
+    inside: BoolArray,
+    T: FloatArray,
+    sigma_px: float,
+    share: float = 1.0,
 ) -> ModelCheck:
     """Test a fit for nuisances, and return their effect at other poses.
 
     solution : fit, of few markers; errors : of its parameters at a noise of one pixel.
     there : problem of the same markers at the other poses; inside : (V, N) its images that count.
-    T : (rows, r) changes of these images by ``errors``; sigma_px : noise of a coordinate, px.
+    T : (rows, r) changes of these images by ``errors``; sigma_px : noise of a coordinate, px; share : that
+    these detections are of those by whose noise a deviation is hidden.
     """
     extent = _Extent.of(solution)
     tests = _Tests(solution, errors, _nuisances(solution.problem, solution.params, extent))
@@ -588,7 +595,7 @@ def examine(
     factor = np.sqrt(_design(tests, tests.r, T, sigma_px))
     at_recorded = sigma_px * np.sqrt(2.0 * np.square(tests.U).sum() / max(len(tests.r), 1))
     shown = tests.r_first - tests.r
-    if total <= factor * independent_px:  # noise hides it
+    if total <= factor * independent_px * np.sqrt(share):  # noise hides it
         factor = np.sqrt(_design(tests, tests.r_first, T, sigma_px)) if chosen else factor
         found, total, bias, shown = [], 0.0, bias[:, :0], np.zeros(1)
     at_recorded = float(np.hypot(factor * at_recorded, effects.rms(shown)))

@@ -187,11 +187,12 @@ def _predicted_error(spread: FloatArray) -> tuple[float, float]:
 
 
 def check_model(solution: Solution, errors: Errors, sigma_px: float) -> ModelCheck:
-    """Test a fit for deviations from the model, by at most ``MAX_JUDGED`` markers, at a noise, px."""
-    few = solution.thinned(MAX_JUDGED)
+    """Test a fit for deviations from the model, by the markers that are ``judged``, at a noise, px."""
+    few = solution.judged()
     if few is not solution:
         errors = few.errors()
-    return examine(few, errors, *_Uncertainty.of(few, errors).within_ranges(), sigma_px)
+    share = few.used.sum() / solution.thinned(MAX_JUDGED).used.sum()
+    return examine(few, errors, *_Uncertainty.of(few, errors).within_ranges(), sigma_px, share)
 
 
 @dataclass(frozen=True, eq=False)
