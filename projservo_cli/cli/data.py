@@ -406,7 +406,8 @@ def _validate(
     refusing = [one for one in value["findings"] if one.severity == REFUSES]
     if refusing:
         of_view = "{view} camera: median {median_px:.3g} px of {count} pairs, {limit_px:.3g} px allowed"
-        words += [wrapped(of_view.format_map(one), "  ") for one in value["views"] if one["count"]]
+        limited = (one for one in value["views"] if one["count"] and one["limit_px"] is not None)
+        words += [wrapped(of_view.format_map(one), "  ") for one in limited]
     console.report(value, words)
     if not refusing:
         return

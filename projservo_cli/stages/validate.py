@@ -22,8 +22,8 @@ def compared(
 ) -> dict[str, Any]:
     """Return statistics of residuals as ``residual_statistics``, with what changed since the calibration.
 
-    Frames of one posture show that as they do to ``doctor``. Of several postures the medians decide, as
-    some images of a recording may be off: what changed is told beside them.
+    Frames of one posture show that as they do to ``doctor``, and no view has a limit of its own. Of several
+    postures the medians decide, as some images of a recording may be off: what changed is told beside them.
 
     Raises InputError as ``residual_statistics``.
     """
@@ -34,7 +34,8 @@ def compared(
         return value
     fault = fault_at_rest(calibration, seen, image_sizes(image_size, calibration.view))
     if (np.ptp(seen.q, axis=0) <= SAME_READING).all():
-        return value | {"findings": [*told, *([fault] if fault else ())]}
+        views = [one | {"limit_px": None} for one in value["views"]]  # medians of one posture decide nothing
+        return value | {"views": views, "findings": [*told, *([fault] if fault else ())]}
     changed = [replace(fault, severity=LIMITS)] if fault else []
     advice = (f"at some poses {text}" for text in lines(changed, setup_of(calibration)))
     return value | {

@@ -39,7 +39,9 @@ def codes(one):
 @pytest.mark.parametrize("off", [0.0, 1.5])
 def test_frames_of_one_posture_are_judged_as_doctor_judges_them(rig, off):
     shown = images(rig, np.repeat(rig[0].q_reference[None], FRAMES, axis=0), np.array([off, 0.0]))
-    fault, findings = fault_at_rest(rig[1], shown), compared(rig[1], shown)["findings"]
+    fault, value = fault_at_rest(rig[1], shown), compared(rig[1], shown)
+    findings = value["findings"]
+    assert {one["limit_px"] for one in value["views"]} == {None}
     assert (fault is not None) == bool(off)
     assert [one.code for one in findings] == ([fault.code] if fault else [])
     if fault:
