@@ -2,8 +2,7 @@
 
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
-from itertools import pairwise
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,7 +22,7 @@ from projservo_cli.monitoring.frame_pairs import at_known_markers, mean_image
 from projservo_cli.planning.model_spread import Region
 from projservo_cli.planning.pose_selection import RefitPoses, refit_poses
 from projservo_cli.records import Calibration, FloatArray, InputError, Observation, WorkFailed
-from projservo_cli.robots.contract import PluginRobot, Reading, at_rest_after
+from projservo_cli.robots.contract import PluginRobot, at_rest_after
 from projservo_cli.robots.pacing import Steered
 from projservo_cli.robots.standstill import frames_of
 from projservo_cli.stages import Progress, silent
@@ -130,9 +129,8 @@ def _seen(robot: PluginRobot, inputs: PreflightInputs, progress: Progress) -> Ro
         time.sleep(period)
         readings.append(robot.read())
         progress("look", len(readings), wanted)
-    s, scatter = zip(*(_mean(readings, view) for view in range(len(robot.view))), strict=True)
-    marker = np.array(inputs.numbers, dtype=np.int64)
-    shown, fresh = frames_of(readings, marker)
+    shown, fresh = frames_of(readings, np.array(inputs.numbers, dtype=np.int64))
+    s, scatter = zip(*(_mean(shown.images[new, v]) for v, new in enumerate(fresh.T)), strict=True)
     own, cameras, views = robot.robot, list[VideoCamera](), list[View]()
     if isinstance(own, CameraRobot):
         cameras, views = own.cameras, [view for view in own.views if view is not None]
@@ -153,10 +151,8 @@ def _seen(robot: PluginRobot, inputs: PreflightInputs, progress: Progress) -> Ro
     )
 
 
-def _mean(readings: Sequence[Reading], view: int) -> tuple[FloatArray, FloatArray]:
-    """Mean (m, 2) of the new frames of a view, NaN where most show no marker, and scatter (m,), px."""
-    new = [readings[0], *(b for a, b in pairwise(readings) if b.new_views(a)[view])]
-    s = np.array([look.s[view] for look in new])
+def _mean(s: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Mean (m, 2) of frames (K, m, 2) of a view, NaN where most show no marker, and scatter (m,), px."""
     mean, scatter = mean_image(s), np.full(s.shape[1], np.nan)
     often = np.isfinite(mean[:, 0])
     if len(s) > 2:

@@ -328,7 +328,7 @@ class _Tests:
         for number, one in enumerate(nuisances):
             columns = whitened((one.columns * used[..., None, None]).reshape(2 * used.size, -1))
             self.units.append(_unit(one.kind, columns))
-            self.Z[:, slice(*self.parts[number : number + 2])] = columns @ self.units[-1]
+            self.Z[:, self.part(number)] = columns @ self.units[-1]
             if one.timed == _DRIFT:
                 self.Z[:, self.part(number)] *= self._over_rows(_DRIFT, 0)
         self.nuisances = [one._replace(columns=np.zeros(0)) for one in nuisances]  # as large again

@@ -9,12 +9,13 @@ import numpy as np
 from projservo_cli.calibration.detections import RAYLEIGH, Detections
 from projservo_cli.calibration.robust_fit import Solution
 from projservo_cli.findings import LIMITS, Finding, Subject
-from projservo_cli.records import BoolArray, FloatArray, IntArray
+from projservo_cli.records import BoolArray, IntArray
 
-# Median residual, in σ, below which images show a pose.
-_SHOWS = 3.0
-# Share of the detections of an image that are rejected where it may show another pose, and minimum number.
-_MOSTLY, _SEEN = 0.5, 4
+# Median residual, in σ, below which something explains a pose.
+EXPLAINED = 3.0
+# Minimum share of the detections of an image that are rejected where its camera moved, or it shows another
+# pose, and minimum number of them: two more than its motion has coordinates, to test it.
+MOSTLY, SEEN_OF_IMAGE = 0.5, 4
 # Median residual by another order of joints over that by the order as given, below which it explains poses;
 # maximum number of joints of which all orders are tried, and of markers by which.
 _EXPLAINS, _MOST_JOINTS, _ORDERED = 0.2, 6, 8
@@ -26,16 +27,19 @@ def shown_poses(solution: Solution, out: BoolArray) -> IntArray:
     out : (V, N) rejected detections, most of those of each of these images.
     """
     detections, found = solution.problem.detections, list[tuple[int, int, int]]()
-    poses, limit_px = detections.pose_of, _limit_px(solution)
-    predicted = np.empty((0,))
+    if not out.any():
+        return np.zeros((0, 3), dtype=np.int64)
+    predicted = solution.params.predict(solution.problem.joints(solution.params))
+    effect_px, poses = solution.joint_effect()[1], detections.pose_of
+    limit_px = EXPLAINED * RAYLEIGH * float(np.hypot(solution.sigma_px, effect_px))
     for k in np.unique(poses[out.any(axis=0)]).tolist():
         at = poses == k
         seen, gone = (detections.seen & at).sum(axis=1), (out & at).sum(axis=1)
-        off, kept = (gone > _MOSTLY * seen) & (seen >= _SEEN), (seen >= _SEEN) & (gone < _MOSTLY * seen)
+        enough = seen >= SEEN_OF_IMAGE
+        off, kept = enough & (gone > MOSTLY * seen), enough & (gone < MOSTLY * seen)
         if not kept.any():
             continue
         for v in np.flatnonzero(off).tolist():
-            predicted = predicted if predicted.size else _of_all_poses(solution)
             rows = np.flatnonzero(detections.seen[v] & at)
             apart = predicted[:, v, detections.marker_of[rows]] - detections.pixels[v, rows]
             level = np.nan_to_num(np.median(np.linalg.norm(apart, axis=2), axis=1), nan=np.inf)
@@ -82,13 +86,3 @@ def other_order(solution: Solution, poses: IntArray) -> bool:
     else:
         orders = [(*given[:i], i + 1, i, *given[i + 2 :]) for i in range(n - 1)]
     return min(map(level, orders)) <= _EXPLAINS * level(given) if len(poses) and orders else False
-
-
-def _of_all_poses(solution: Solution) -> FloatArray:
-    """Pixels (K, V, m, 2) by the readings of all poses."""
-    return solution.params.predict(solution.problem.joints(solution.params))
-
-
-def _limit_px(solution: Solution) -> float:
-    """Median residual, px, of images that show a pose, with the noise of joints."""
-    return _SHOWS * RAYLEIGH * float(np.hypot(solution.sigma_px, solution.joint_effect()[1]))

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from projservo_cli.calibration.bundle_adjustment import LeastSquares, fit_offsets
 from projservo_cli.calibration.checks.model_error import image_motions
-from projservo_cli.calibration.checks.other_poses import shown_poses
+from projservo_cli.calibration.checks.other_poses import EXPLAINED, MOSTLY, SEEN_OF_IMAGE, shown_poses
 from projservo_cli.calibration.detections import RAYLEIGH, Detections
 from projservo_cli.calibration.epipolar import OUTLIER
 from projservo_cli.calibration.initialization import stationary
@@ -21,17 +21,12 @@ from projservo_cli.calibration.robust_fit import Solution, median_px
 from projservo_cli.findings import LIMITS, Finding, Subject
 from projservo_cli.records import BoolArray, FloatArray, IntArray
 
-# Median residual, in σ, below which a corrected joint reading explains a pose.
-_CORRECTED = 3.0
 # Maximum number of observations of a pose in the search for wrong joint readings.
 MAX_OF_POSE = 50
 # Minimum number of detections of a marker to diagnose it.
 _SEEN = 3
-# Minimum share of the detections of an image that are rejected where its camera may have moved.
-_MOSTLY = 0.5
-# Minimum number of detections of such an image: two more than its motion has coordinates, to test it.
-_SEEN_OF_IMAGE = 4
-# Maximum motion of such an image, over the spread of its markers, where no other view shows the joints.
+# Maximum motion of an image whose camera moved, over the spread of its markers, where no other view shows
+# the joints.
 _SMALL_MOTION = 0.1
 # Minimum number of poses over which a camera settles, and of later ones, whose shifts are by chance.
 _SETTLES, _LATER = 2, 10
@@ -100,7 +95,7 @@ def _moved_images(solution: Solution, out: BoolArray) -> IntArray:
     residual /= np.maximum(detections.weight[..., None], 1e-300)
     for view, k in itertools.product(range(len(out)), np.unique(detections.pose_of[out.any(axis=0)])):
         rows = np.flatnonzero(detections.seen[view] & (detections.pose_of == k))
-        if rows.size < _SEEN_OF_IMAGE or np.count_nonzero(out[view, rows]) < _MOSTLY * rows.size:
+        if rows.size < SEEN_OF_IMAGE or np.count_nonzero(out[view, rows]) < MOSTLY * rows.size:
             continue
         x = detections.pixels[view, rows] - detections.pixels[view, rows].mean(axis=0)
         radius = float(np.sqrt((x**2).sum(axis=1).mean()))
@@ -114,9 +109,9 @@ def _moved_images(solution: Solution, out: BoolArray) -> IntArray:
         median = float(np.median(np.linalg.norm(fit.fun.reshape(-1, 2), axis=1)))
         at = detections.pose_of == k
         seen, used = (detections.seen & at).sum(axis=1), (solution.used & at).sum(axis=1)
-        alone = bool((used > _MOSTLY * np.maximum(seen, _SEEN_OF_IMAGE)).any())
+        alone = bool((used > MOSTLY * np.maximum(seen, SEEN_OF_IMAGE)).any())
         small = np.abs(fit.x).max() <= _SMALL_MOTION * radius
-        if median <= _CORRECTED * RAYLEIGH * sigma and (alone or small):
+        if median <= EXPLAINED * RAYLEIGH * sigma and (alone or small):
             found.append((int(k), view))
     found = _of_cameras(detections, found)
     for view in {view for _, view in found}:
@@ -150,7 +145,7 @@ def _settling(
     """
     poses, known = np.unique(detections.pose_of), {k for k, _ in moved}
     at = [(detections.pose_of == k) & detections.seen[view] for k in poses]
-    sound = np.array([rows.any() and out[rows].mean() < _MOSTLY for rows in at])
+    sound = np.array([rows.any() and out[rows].mean() < MOSTLY for rows in at])
     first = next((i for i, k in enumerate(poses.tolist()) if k not in known), len(poses))
     here = [i for i in range(first) if (int(poses[i]), view) in moved]
     if first < _SETTLES or not here or sound[:first].any():
@@ -226,7 +221,7 @@ def fits_other_joints(pose: LeastSquares, params: Parameters, q: FloatArray, sig
     levels = [median_px(one.residual(params), one.detections.seen) for one in poses]
     nearest = poses[int(np.argmin(levels))]
     level = min(min(levels), _corrected_level(nearest, params, list(range(q.shape[1])), sigma))
-    return level <= _CORRECTED * RAYLEIGH * sigma
+    return level <= EXPLAINED * RAYLEIGH * sigma
 
 
 def rejection_reasons(solution: Solution, kept: BoolArray) -> IntArray:
@@ -246,7 +241,7 @@ def _wrong_joints(pose: LeastSquares, params: Parameters, sigma: float) -> tuple
     for size in (1, 2):
         pairs = list(itertools.combinations(range(pose.q.shape[1]), size))
         levels = [_corrected_level(pose, params, list(joints), sigma) for joints in pairs]
-        if min(levels, default=np.inf) <= _CORRECTED * RAYLEIGH * sigma:
+        if min(levels, default=np.inf) <= EXPLAINED * RAYLEIGH * sigma:
             return pairs[int(np.argmin(levels))]
     return ()
 

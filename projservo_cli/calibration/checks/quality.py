@@ -191,7 +191,9 @@ def check_model(solution: Solution, errors: Errors, sigma_px: float) -> ModelChe
     few = solution.judged()
     if few is not solution:
         errors = few.errors()
-    share = few.used.sum() / solution.thinned(MAX_JUDGED).used.sum()
+    detections = solution.problem.detections
+    those = np.isin(detections.marker_of, even_choice(detections.marker.size, MAX_JUDGED))
+    share = few.used.sum() / solution.used[:, those].sum()
     return examine(few, errors, *_Uncertainty.of(few, errors).within_ranges(), sigma_px, share)
 
 
