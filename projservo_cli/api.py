@@ -204,9 +204,8 @@ def calibrate(
         that of the observations, else estimated.
     max_predicted_px : error of predictions by deviations of arm and rig from the model, px, above which the
         calibration is not usable; by default 1 % of the image size.
-    joint_model : curves of the joints to fit: ``auto`` for those that the images show, or of ``scale``,
-        ``quadratic``, ``cubic``, ``harmonic``, ``coupling`` and ``sag``, of all or of one: ``scale:2``; a
-        list, or a text with commas.
+    joint_model : curves of the joints to fit: ``auto`` for those that the images show, or kinds such as
+        ``scale``, of all or of one: ``scale:2``; a list, or a text with commas.
     noise_px : standard deviation of a coordinate, px; by default that of the observations, else estimated.
     seed : of the random starts; by default that of the observations.
     progress : called as ``progress(what, done, total)``; True for a bar in a terminal, False for none.

@@ -10,16 +10,13 @@ from typing import Any
 
 import numpy as np
 
+from projservo_cli.deviations import DEVIATIONS, SHARE
+
 # Distance and angle by which a joint moves as far as another, m and rad: predictions are assessed there.
 REACH_M, REACH_RAD = 0.15, 0.5
 # Severities: a note changes nothing, a finding that limits makes the result less exact, and one that refuses
 # makes it useless.
 NOTE, LIMITS, REFUSES = "note", "limits", "refuses"
-# Codes of deviations of an arm or a rig from the model.
-DEVIATIONS = (
-    *("scale", "quadratic", "cubic", "harmonic", "coupling", "sag", "joint_drift", "joint_step"),
-    *("camera_drift", "camera_step", "base", "tool", "lens", "lens_center", "focus", "cyclic", "memory"),
-)
 
 
 @dataclass(frozen=True)
@@ -131,6 +128,6 @@ def _parsed(word: str, units: Sequence[str]) -> Finding:
     """Return a finding on what ``named`` wrote."""
     code, joints, view = word.split("|")
     which = tuple(int(joint) for joint in joints.split(",") if joint)
-    of_joint = units[which[-1] - 1] if which else "px"
-    subject = Subject(joints=which, views=(view,) if view else ())
-    return Finding(code, LIMITS, subject, unit="1" if code in ("scale", "coupling", "memory") else of_joint)
+    subject, unit = Subject(joints=which, views=(view,) if view else ()), DEVIATIONS[code].unit
+    of_joint = units[which[-1] - 1] if which else unit
+    return Finding(code, LIMITS, subject, unit=unit if unit == SHARE else of_joint)

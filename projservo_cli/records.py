@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from projservo_cli.findings import DEVIATIONS, LIMITS, Finding, Subject
+from projservo_cli.deviations import DEVIATIONS
+from projservo_cli.findings import LIMITS, Finding, Subject
 from projservo_cli.passwords import masked
 
 FloatArray = npt.NDArray[np.float64]
@@ -174,9 +175,9 @@ def position_limits(lower: FloatArray, upper: FloatArray) -> JointLimits:
 class JointCurve(NamedTuple):
     """True joints less readings as a sum of terms c φ(x), all zero at the reference.
 
-    φ is x, x², x³, sin x, 1 − cos x of a reading x from the reference, or the torque of weights behind the
-    joint that it moves, less that at the reference. That needs an arm as it was before the fit: its
-    own errors times a deflection are of second order.
+    φ is a function of a reading x from the reference, such as x² or sin x, or the torque of weights behind
+    the joint that it moves, less that at the reference. That needs an arm as it was before the fit: its own
+    errors times a deflection are of second order.
     """
 
     terms: FloatArray  # (T, 4) index of φ in ``BASIS``, joint moved and joint read from 0, and c, rad or m
@@ -185,7 +186,6 @@ class JointCurve(NamedTuple):
     arm: FloatArray
 
 
-BASIS = ("linear", "square", "cube", "sine", "versine", "torque")
 FROM_ONE = np.array([0.0, 1.0, 1.0, 0.0])  # adds to terms what numbers joints from 1
 NO_CURVE = JointCurve(np.zeros((0, 4)), np.zeros((0, 5, 4)))
 

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from projservo_cli import words
-from projservo_cli.findings import DEVIATIONS, LIMITS, REFUSES, Finding, Subject, sparse
+from projservo_cli.deviations import DEVIATIONS
+from projservo_cli.findings import LIMITS, REFUSES, Finding, Subject, sparse
 from projservo_cli.records import TOOL, WORLD
 from projservo_cli.words import table
 

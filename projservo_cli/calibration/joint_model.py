@@ -1,8 +1,8 @@
 """Joints that are not ideal: curves of readings, coupling and deflection, fitted with all else.
 
-Each hypothesis adds terms to the curve of true joints by readings: scale x, quadratic x and x², cubic also
-x³, harmonic sin x and 1 − cos x, coupling by another reading, and sag, a deflection of each revolute joint
-that follows the torque of weights at the tool, or along the arm. Automatic choice takes one by one what the
+Each hypothesis is a row of ``DEVIATIONS`` with functions that add terms to the curve of true joints by
+readings; sag is a deflection of each revolute joint that follows the torque of weights at the tool, or along
+the arm. Automatic choice takes one by one what the
 score tests name, and what explains the images about as well. It keeps the hypothesis that predicts left-out
 poses best, if by more than chance, and stops where none does.
 """
@@ -19,9 +19,9 @@ from projservo_cli.calibration.checks.model_error import suspected
 from projservo_cli.calibration.detections import MAX_JUDGED, per_rad
 from projservo_cli.calibration.epipolar import ImageGeometry
 from projservo_cli.calibration.robust_fit import Solution, fit_from, left_out_errors, left_out_px
+from projservo_cli.deviations import ARGUMENTS, BASIS, CURVES, DEVIATIONS, PAIR
 from projservo_cli.geometry.joint_curve import basis, slopes, torques
 from projservo_cli.records import (
-    BASIS,
     NO_CURVE,
     TOOL,
     Calibration,
@@ -32,24 +32,6 @@ from projservo_cli.records import (
 )
 from projservo_cli.words.values import quantity
 
-# Functions of each kind; those of a coupling read another joint.
-_FUNCTIONS = {
-    "scale": ("linear",),
-    "quadratic": ("linear", "square"),
-    "cubic": ("linear", "square", "cube"),
-    "harmonic": ("sine", "versine"),
-    "coupling": ("linear",),
-    "sag": ("torque",),
-}
-_KINDS = tuple(_FUNCTIONS)
-_ARGUMENTS = {
-    "linear": "reading {}",
-    "square": "square of reading {}",
-    "cube": "cube of reading {}",
-    "sine": "sine of reading {}",
-    "versine": "1 − cosine of reading {}",
-    "torque": "torque, of which the largest is 1",
-}
 AUTO = "auto"
 # Standard deviations of chance by which squared errors at left-out poses must fall.
 _SURE = 2.0
@@ -97,13 +79,14 @@ def hypotheses_of(asked: str | Iterable[str], joint_types: str, mount: str) -> l
     slides = [i for i, kind in enumerate(joint_types, 1) if kind.upper() == "P"]
     for word in asked:
         kind, _, which = word.partition(":")
-        if kind not in _FUNCTIONS or (which and kind == "sag"):
-            raise InputError(f"joint model {word!r}: choose auto, or of {', '.join(_KINDS)}, such as scale:2")
+        if kind not in CURVES or (which and kind == "sag"):
+            raise InputError(f"joint model {word!r}: choose auto, or of {', '.join(CURVES)}, such as scale:2")
+        row = DEVIATIONS[kind]
         try:
             joints = tuple(int(number) for number in which.split("-") if number)
         except ValueError:
             joints = (0,)
-        count = 2 if kind == "coupling" else 1
+        count = 2 if row.part == PAIR else 1
         if any(not 1 <= j <= n for j in joints) or (joints and len(set(joints)) != count):
             example = "coupling:1-2, joint read and joint moved" if count == 2 else f"{kind}:1"
             raise InputError(f"joint model {word!r}: joints are 1 to {n}; write {kind}, or {example}")
@@ -116,16 +99,15 @@ def hypotheses_of(asked: str | Iterable[str], joint_types: str, mount: str) -> l
                 f"joint model {word!r}: images do not show the scale of prismatic joint {slides[0]}, which "
                 "sets that of the frame: leave it out; metric --scale takes it from a known length"
             )
-        if kind == "harmonic" and set(joints) & set(slides):
+        if row.turns and set(joints) & set(slides):
             raise InputError(f"joint model {word!r}: prismatic joint {joints[0]} has no turn; leave it out")
         # A coupling needs two joints, a prismatic joint has no turn, and the first one no scale; where none
         # turns, the load of each is constant.
-        turn = n - len(slides)
-        others = {"coupling": n - 1, "harmonic": turn, "sag": turn, "scale": n - bool(slides)}
-        if not others.get(kind, n):
+        others = {"coupling": n - 1, "scale": n - bool(slides)}
+        if not others.get(kind, n - len(slides) if row.turns else n):
             raise InputError(f"joint model {word!r}: no joint of {joint_types} can have it; leave it out")
         pairs = [(i, j) for i in range(1, n + 1) for j in range(1, n + 1) if i != j]
-        found += [Hypothesis(kind, one) for one in (pairs if kind == "coupling" and not joints else [joints])]
+        found += [Hypothesis(kind, one) for one in (pairs if count == 2 and not joints else [joints])]
     return list(dict.fromkeys(found))
 
 
@@ -187,14 +169,14 @@ def _terms(chosen: Iterable[Hypothesis], solution: Solution) -> dict[Hypothesis,
     prismatic, numbers = solution.params.prismatic, solution.problem.detections.numbers.tolist()
     found = {}
     for one in chosen:
-        joints, functions = [numbers.index(j) for j in one.joints], _FUNCTIONS[one.kind]
+        joints, row = [numbers.index(j) for j in one.joints], DEVIATIONS[one.kind]
         pairs = [(joints[-1], joints[0])] if joints else [(i, i) for i in range(len(numbers))]
-        if one.kind in ("harmonic", "sag"):
+        if row.turns:
             pairs = [(i, by) for i, by in pairs if not prismatic[i]]
         # The first prismatic joint of the arm sets the scale of the frame.
         first = min((number for number, slides in zip(numbers, prismatic, strict=True) if slides), default=0)
         unknown = [(BASIS.index("linear"), i, i) for i, number in enumerate(numbers) if number == first]
-        terms = [(BASIS.index(f), i, by) for f in functions for i, by in pairs]
+        terms = [(BASIS.index(f), i, by) for f in row.curve for i, by in pairs]
         found[one] = [term for term in terms if term not in unknown]
     return found
 
@@ -210,7 +192,7 @@ def describe_curve(calibration: Calibration) -> list[dict[str, Any]]:
         factor, unit = (1e3, " mm") if slides else (float(np.degrees(1.0)), "°")
         if function in ("linear", "square", "cube"):
             factor, unit = (100.0, " %") if function == "linear" else (1.0, "")
-        argument = _ARGUMENTS[function].format(int(read))
+        argument = ARGUMENTS[function].format(int(read))
         text = f"joint {int(moved)}: {factor * c:.2g}{unit} ± {factor * deviation:.1g}{unit} × {argument}"
         numbers = {"joint": int(moved), "by": int(read), "coefficient": c, "deviation": deviation}
         errors = {"left_out_without_px": before, "left_out_px": after}
@@ -289,7 +271,7 @@ class _Search:
         for kind, joints in suspected(solution.thinned(MAX_JUDGED)):
             if kind == "sag":
                 found += [] if solution.problem.detections.mount == TOOL else [Hypothesis("sag", ())]
-            elif kind in _FUNCTIONS:
+            elif kind in CURVES:
                 found.append(Hypothesis(kind, () if kind == "scale" and len(joints) > 1 else joints))
         found = list(dict.fromkeys(found))
         return [*_in_all(found[:_NAMED]), *found]

@@ -141,8 +141,8 @@ def calibrate(
         not usable; None takes 1 % of the image size.
     mount : ``world`` for cameras that watch the tool, ``tool`` for cameras on it that watch the scene.
     joint_model : curves of the joints that ``bundle_adjustment`` fits: ``auto`` for those that the images
-        show, or some of ``scale``, ``quadratic``, ``cubic``, ``harmonic``, ``coupling`` and ``sag``, of all
-        joints or of one, as ``scale:2``; None where joints are as they read.
+        show, or some of ``CURVES``, of all joints or of one, as ``scale:2``; None where joints are as they
+        read.
     fitted : called with the solution of ``bundle_adjustment`` and its noise, px.
     progress : called with the current task of ``bundle_adjustment``, how much of it is done, and its total.
 

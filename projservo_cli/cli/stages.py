@@ -12,6 +12,7 @@ from click.shell_completion import CompletionItem
 from projservo_cli.cli import options as option
 from projservo_cli.cli.output import Console, visible, words_of, wrapped
 from projservo_cli.cli.program import FAILED, main
+from projservo_cli.deviations import CURVES
 
 if TYPE_CHECKING:
     from projservo_cli.chain import Chain
@@ -56,8 +57,8 @@ _OF_STAGES = (
     click.option(
         "--joint-model",
         metavar="auto|LIST",
-        help="Fit curves of the joints: those that the images show, or of scale, quadratic, cubic, harmonic, "
-        "coupling, sag, such as scale:2,sag.",
+        help=f"Fit curves of the joints: those that the images show, or of {', '.join(CURVES)}, such as "
+        "scale:2,sag.",
     ),
     click.option(
         "--image-size",

@@ -1,27 +1,38 @@
 """True joints by readings: curves of gears and encoders, coupling, deflection under weights."""
 
 import math
+from collections.abc import Callable
 from itertools import accumulate
 
 import numpy as np
 
+from projservo_cli.deviations import BASIS
 from projservo_cli.geometry.algebra import add, apply, dot, mat, vec
 from projservo_cli.geometry.displacements import displacements, rotation, translation
 from projservo_cli.geometry.jit import inline, internal
-from projservo_cli.records import BASIS, BoolArray, FloatArray, JointCurve, Model
+from projservo_cli.records import BoolArray, FloatArray, JointCurve, Model
 
 # Step of the differences by which a curve is differentiated, rad or m: third derivatives leave 1e-11 of it.
 _STEP = 1e-5
-_LINEAR, _SQUARE, _CUBE, _SINE, _VERSINE, _TORQUE = range(len(BASIS))
-_EVEN = [BASIS.index("square"), BASIS.index("versine")]
+_SQUARE, _CUBE, _SINE, _VERSINE, _TORQUE = map(BASIS.index, ("square", "cube", "sine", "versine", "torque"))
+_EVEN = [_SQUARE, _VERSINE]
+# Functions of a reading from the reference, rad or m; a torque is one of all readings.
+OF_READING: dict[str, Callable[[FloatArray], FloatArray]] = {
+    "linear": lambda x: x,
+    "square": lambda x: x**2,
+    "cube": lambda x: x**3,
+    "sine": np.sin,
+    "versine": lambda x: 2.0 * np.sin(0.5 * x) ** 2,
+}
 
 
 def basis(curve: JointCurve, prismatic: BoolArray, x: FloatArray) -> FloatArray:
     """Return φ (K, T) of each term at readings (K, n) from the reference, rad or m."""
     kind, joint, by = curve.terms[:, :3].astype(np.int64).T
     x_by, values = x[:, by], np.zeros((len(x), len(kind)))
-    for index, phi in enumerate((x_by, x_by**2, x_by**3, np.sin(x_by), 2.0 * np.sin(0.5 * x_by) ** 2)):
-        values = np.where(kind == index, phi, values)
+    for name, phi in OF_READING.items():
+        of = kind == BASIS.index(name)
+        values[:, of] = phi(x_by[:, of])
     if (kind == _TORQUE).any():
         there = torques(curve.arm[:-1, :4], prismatic, curve.arm[:, 4], np.vstack([x, 0.0 * x[:1]]))
         down = (there[:-1] - there[-1]) @ curve.arm[-1, 0, :3]
@@ -94,6 +105,21 @@ def _torque(
     return dot((float(arm[n, 0, 0]), float(arm[n, 0, 1]), float(arm[n, 0, 2]), 0.0), v)
 
 
+@inline
+def _value_and_slope(kind: int, x: float) -> tuple[float, float]:
+    """Value of a function of a reading, by its index in ``BASIS``, and its derivative."""
+    if kind == _SQUARE:
+        return x * x, 2.0 * x
+    if kind == _CUBE:
+        return x * x * x, 3.0 * x * x
+    if kind == _SINE:
+        return math.sin(x), math.cos(x)
+    if kind == _VERSINE:
+        half = math.sin(0.5 * x)
+        return 2.0 * half * half, math.sin(x)
+    return x, 1.0
+
+
 @internal
 def bend(model: Model, q: FloatArray, ahead: FloatArray, share: float, i: int) -> float:
     """True joint i less its reading, interpolated by a share from joints q (n,) to those ahead, rad or m."""
@@ -102,21 +128,11 @@ def bend(model: Model, q: FloatArray, ahead: FloatArray, share: float, i: int) -
     for t in range(terms.shape[0]):
         if int(terms[t, 1]) != i:
             continue
-        kind = int(terms[t, 0])
-        x = _reading(model, q, ahead, share, int(terms[t, 2]))
-        value = x
-        if kind == _SQUARE:
-            value = x * x
-        elif kind == _CUBE:
-            value = x * x * x
-        elif kind == _SINE:
-            value = math.sin(x)
-        elif kind == _VERSINE:
-            half = math.sin(0.5 * x)
-            value = 2.0 * half * half
-        elif kind == _TORQUE:
+        if int(terms[t, 0]) == _TORQUE:
             value = _torque(model, q, ahead, share, i, -1, 0.0, 1.0)
             value -= _torque(model, q, ahead, share, i, -1, 0.0, 0.0)
+        else:
+            value = _value_and_slope(int(terms[t, 0]), _reading(model, q, ahead, share, int(terms[t, 2])))[0]
         total += float(terms[t, 3]) * value
     return total
 
@@ -130,18 +146,10 @@ def slope(model: Model, q: FloatArray, i: int, j: int) -> float:
         kind = int(terms[t, 0])
         if int(terms[t, 1]) != i or (int(terms[t, 2]) != j and kind != _TORQUE):
             continue
-        x = _reading(model, q, q, 0.0, j)
-        value = 1.0
-        if kind == _SQUARE:
-            value = 2.0 * x
-        elif kind == _CUBE:
-            value = 3.0 * x * x
-        elif kind == _SINE:
-            value = math.cos(x)
-        elif kind == _VERSINE:
-            value = math.sin(x)
-        elif kind == _TORQUE:
+        if kind == _TORQUE:
             farther = _torque(model, q, q, 0.0, i, j, _STEP, 1.0)
-            value = (farther - _torque(model, q, q, 0.0, i, j, -_STEP, 1.0)) / (2.0 * _STEP)
-        total += float(terms[t, 3]) * value
+            by_reading = (farther - _torque(model, q, q, 0.0, i, j, -_STEP, 1.0)) / (2.0 * _STEP)
+        else:
+            by_reading = _value_and_slope(kind, _reading(model, q, q, 0.0, j))[1]
+        total += float(terms[t, 3]) * by_reading
     return total

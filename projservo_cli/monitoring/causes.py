@@ -4,6 +4,7 @@ from itertools import product
 
 import numpy as np
 
+from projservo_cli.deviations import CHANGES, JOINT, MARKERS, PX, READING, SECONDS
 from projservo_cli.findings import REFUSES, Finding, Subject
 from projservo_cli.monitoring.hypotheses import ALL, Explanation
 from projservo_cli.records import CORNERS, Calibration, FloatArray, IntArray
@@ -13,29 +14,12 @@ _FLEXIBLE = np.radians(1.0)
 # A tag that is off by less than this share of its side is neither turned by quarters nor exchanged; share of
 # that which may be left where it is.
 _SIDE, _FITS = 0.5, 0.15
-# Codes by the kind of a cause whose amount is by how much images show it, and of others with their units.
-_SEEN = {
-    "exchanged": "exchanged_cameras",
-    "flexible": "flexing_links",
-    "camera": "displaced_camera",
-    "cropped": "cropped_images",
-    "rig": "displaced_rig",
-    "tool": "displaced_tool",
-}
-_FITTED = {
-    "mirrored": ("mirrored_joint", ""),
-    "frozen": ("frozen_reading", ""),
-    "late": ("late_images", "s"),
-    "sized": ("resized_images", ""),
-    "focused": ("refocused_camera", "1"),
-    "larger": ("larger_tags", "1"),
-}
 
 
 def group_of(explanation: Explanation) -> tuple[str, int, tuple[int, ...]]:
     """Kind, index and views that a cause is named by: those with the same sentence have the same."""
     cause = explanation.cause
-    if cause.kind in ("shifted", "camera", "cameras", "rig"):
+    if cause.row.code in ("displaced_camera", "cropped_images", "displaced_rig"):
         return "rig" if cause.which == ALL else "camera", ALL, cause.views
     return cause.kind, cause.which, cause.views
 
@@ -48,33 +32,23 @@ def is_slight(angles: FloatArray | float) -> bool:
 def finding_of(explanation: Explanation, calibration: Calibration) -> Finding:
     """Return the finding on a cause."""
     cause, theta = explanation.cause, explanation.theta.tolist()
-    kind, i, names = cause.kind, cause.which, calibration.view
-    if kind in ("tag", "marker"):
+    row, i, views = cause.row, cause.which, cause.views
+    if row.part == MARKERS:
         return _displaced(explanation, calibration)
-    if kind == "slipped":
-        slides = calibration.joint_types[i] == "P"
-        flexes = (Finding("flexing_links"),) if not slides and is_slight(theta[0]) else ()
-        return Finding(
-            "slipped_joint",
-            REFUSES,
-            Subject((i + 1,)),
-            theta[0],
-            unit="m" if slides else "rad",
-            others=flexes,
-        )
-    if kind in ("shifted", "camera", "cameras"):
-        kind = "camera" if i != ALL else "cropped" if kind == "shifted" else "rig"
-    if kind in ("mirrored", "frozen"):
-        subject = Subject(joints=() if i < 0 else (i + 1,))
-    elif kind == "exchanged":
-        subject = Subject(views=tuple(names[v] for v, shown in enumerate(cause.views) if v != shown))
-    else:
-        subject = Subject(views=tuple(names[v] for v in cause.views))
-    if kind in _SEEN:
-        return Finding(_SEEN[kind], REFUSES, subject, explanation.seen_px, unit="px")
-    code, unit = _FITTED[kind]
-    each = tuple(Finding("delay", amount=delay, unit="s") for delay in theta) if kind == "late" else ()
-    return Finding(code, REFUSES, subject, theta[0] if theta else np.nan, unit=unit, others=each)
+    amount, unit, others = theta[0] if theta else np.nan, row.unit, tuple[Finding, ...]()
+    if cause.kind == "exchanged":
+        views = tuple(v for v, shown in enumerate(views) if v != shown)
+    if unit == PX:
+        amount = explanation.seen_px
+    elif unit == READING and calibration.joint_types[i] == "P":
+        unit = "m"
+    elif unit == READING and is_slight(amount):
+        others = (Finding("flexing_links"),)
+    elif unit == SECONDS:
+        others = tuple(Finding("delay", amount=delay, unit=unit) for delay in theta)
+    of_joint = row.part == JOINT and i >= 0
+    subject = Subject((i + 1,) if of_joint else (), tuple(calibration.view[v] for v in views))
+    return Finding(row.code, REFUSES, subject, amount, unit=unit, others=others)
 
 
 def _displaced(explanation: Explanation, calibration: Calibration) -> Finding:
@@ -82,7 +56,7 @@ def _displaced(explanation: Explanation, calibration: Calibration) -> Finding:
     moved = sorted(int(calibration.marker[j]) for j in explanation.cause.markers)
     whole = len(moved) == CORNERS and moved[0] // CORNERS == moved[-1] // CORNERS
     subject = Subject(markers=tuple(moved), tag=moved[0] // CORNERS if whole else None)
-    code = "displaced_tag" if whole else "displaced_markers"
+    code = CHANGES["tag" if whole else "marker"].code
     return Finding(code, REFUSES, subject, explanation.seen_px, unit="px")
 
 

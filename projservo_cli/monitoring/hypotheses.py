@@ -9,13 +9,12 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve, expm
 
 from projservo_cli.calibration.prediction import Parameters, from_reference, in_chain_order
+from projservo_cli.deviations import CHANGES, Deviation
 from projservo_cli.image_size import FACTORS
 from projservo_cli.monitoring.frame_pairs import FramePair
 from projservo_cli.monitoring.innovation_tests import ErrorModel, Residual, Sums
 from projservo_cli.records import CORNERS, BoolArray, FloatArray, IntArray
 
-# Images are expected to be changed by so much by any cause, px rms: the prior of its parameters.
-_EXPECTED_PX = 30.0
 # A point that a cause puts behind a camera is off by so much, px.
 _HIDDEN_PX = 1e3
 # Steps of Gauss and Newton, halvings of each, and the change of parameters that derivatives are taken by.
@@ -48,14 +47,19 @@ class _Changed(NamedTuple):
 
 
 class _Cause(NamedTuple):
-    """A cause, by its kind and the joint, view or marker that it is of, or ``ALL`` or ``_SOME`` of them."""
+    """A cause, by its row and the joint, view or marker that it is of, or ``ALL`` or ``_SOME`` of them."""
 
-    kind: str
+    kind: str  # key of ``CHANGES``
     which: int
     starts: FloatArray  # (s, p) parameters that a fit starts from
     change: Callable[[_Changed, FloatArray], _Changed]
     markers: tuple[int, ...] = ()  # that it touches alone
     views: tuple[int, ...] = ()  # of whose cameras it is; for an exchange the camera that each view shows
+
+    @property
+    def row(self) -> Deviation:
+        """Its row of the table."""
+        return CHANGES[self.kind]
 
 
 class Explanation(NamedTuple):
@@ -227,7 +231,7 @@ class Evidence:
         )
         r = self._whitened(here)
         size = np.sqrt(np.square(F).sum(axis=(0, 1)) / self._count(cause))  # px rms a unit
-        unit = _EXPECTED_PX / np.maximum(size, 1e-12)
+        unit = cause.row.size / np.maximum(size, 1e-12)
         F = self._whitened(F * unit)
         across = self._beside.T @ F
         solved = cho_solve(self._factor, across)
@@ -377,7 +381,9 @@ def _image_causes(count: int, centre: FloatArray | None) -> Iterator[_Cause]:
 
     for v, some in _every_and_all(count):
         views = np.isin(np.arange(count), some).astype(np.float64)
-        yield _Cause("shifted", v, _start(2), partial(shifted, views=views), views=some)
+        yield _Cause(
+            "shifted" if v >= 0 else "cropped", v, _start(2), partial(shifted, views=views), views=some
+        )
         yield _Cause("sized", v, np.array(FACTORS)[:, None], partial(sized, views=views), views=some)
         if v >= 0:
             start = _start(3 if centre is None else 1)
@@ -410,9 +416,9 @@ def _camera_causes(count: int, twists: FloatArray) -> Iterator[_Cause]:
         yield _Cause("camera", v, _start(d), partial(turned, views=(v,)), views=(v,))
     several: list[tuple[int, ...]] = [*combinations(every, 2)] if count > 2 else []
     for some in [*several, *([every] if count > 1 else [])]:
-        which = ALL if some == every else _SOME
-        yield _Cause("cameras", which, _start(len(some) * d), partial(turned, views=some), views=some)
-        yield _Cause("cameras", which, _start(2 * len(some)), partial(each_shifted, views=some), views=some)
+        kind, which = ("all_cameras", ALL) if some == every else ("cameras", _SOME)
+        yield _Cause(kind, which, _start(len(some) * d), partial(turned, views=some), views=some)
+        yield _Cause(kind, which, _start(2 * len(some)), partial(each_shifted, views=some), views=some)
     if count > 1:
         yield _Cause("rig", ALL, _start(d), rig, views=every)
 
@@ -466,24 +472,12 @@ def together(moved: list[Explanation]) -> Explanation:
     )
 
 
-# Causes that another contains: with more parameters it explains as much.
-_CONTAINS = {
-    "camera": ("shifted", "focused", "sized", "camera"),
-    "cameras": ("shifted", "focused", "sized", "camera", "rig"),
-    "focused": ("shifted",),
-    "flexible": ("slipped",),
-    "slipped": ("mirrored",),
-    "tag": ("marker",),
-    "tool": ("larger",),
-}
-
-
 def contains(cause: _Cause, other: _Cause) -> bool:
     """Whether a cause explains what another one does, with more parameters."""
     alike = set(other.views) <= set(cause.views) if cause.views else cause.which in (ALL, other.which)
     alike |= set(other.markers) <= set(cause.markers) != set()
     more = cause.starts.shape[1] > other.starts.shape[1]
-    return alike and more and other.kind in _CONTAINS.get(cause.kind, ())
+    return alike and more and other.kind in cause.row.contains
 
 
 def is_possible(fit: Explanation) -> bool:

@@ -5,6 +5,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, StrictBool, StrictInt, StringConstraints
 
+from projservo_cli.deviations import CURVES
 from projservo_cli.settings.sections import (
     Count,
     JointVector,
@@ -106,8 +107,8 @@ class CalibrationSettings(Section):
     )
     joint_model: Literal["auto"] | tuple[str, ...] | None = Field(
         None,
-        description="curves of joints to fit: auto, or a list of scale, quadratic, cubic, harmonic, coupling "
-        "and sag, of all joints or of one, as scale:2 or coupling:4-5; null: joints are as they read",
+        description=f"curves of joints to fit: auto, or a list of {', '.join(CURVES)}, of all joints or of "
+        "one, as scale:2 or coupling:4-5; null: joints are as they read",
     )
 
     refits: tuple[Refit, ...] = Field(

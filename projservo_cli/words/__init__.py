@@ -8,7 +8,8 @@ from dataclasses import replace
 from itertools import groupby
 from typing import Any
 
-from projservo_cli.findings import DEVIATIONS, LIMITS, NOTE, REFUSES, Finding, columns, first, usable
+from projservo_cli.deviations import DEVIATIONS
+from projservo_cli.findings import LIMITS, NOTE, REFUSES, Finding, columns, first, usable
 from projservo_cli.records import Calibration, WorkFailed
 from projservo_cli.words.table import ROWS, Setup
 from projservo_cli.words.values import Told, quantity

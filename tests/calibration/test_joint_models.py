@@ -11,11 +11,12 @@ from projservo_cli.calibration.bundle_adjustment import LeastSquares
 from projservo_cli.calibration.detections import Detections
 from projservo_cli.calibration.joint_model import describe_curve, hypotheses_of
 from projservo_cli.calibration.prediction import Parameters, error_factor, joint_derivative
+from projservo_cli.deviations import BASIS
 from projservo_cli.geometry.displacements import twists
 from projservo_cli.geometry.joint_curve import backwards, slopes, true_joints
 from projservo_cli.geometry.kinematics import backward, forward_between, forward_kinematics, joint_operators
 from projservo_cli.metric.frame import Metric
-from projservo_cli.records import BASIS, NO_CURVE, InputError, JointCurve, Model, WorkFailed, no_lenses
+from projservo_cli.records import NO_CURVE, InputError, JointCurve, Model, WorkFailed, no_lenses
 from projservo_cli.store.run_file import Result, Run, load, save
 from tests.calibration.simulated_robot import around, random_robot, trials
 from tests.calibration.test_cameras_on_the_tool import Hand

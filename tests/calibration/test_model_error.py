@@ -5,9 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 
+from projservo_cli import words
 from projservo_cli.calibration import calibrate, predict
 from projservo_cli.calibration.checks import model_error
-from projservo_cli.findings import DEVIATIONS, REFUSES
+from projservo_cli.deviations import CHANGES, DEVIATIONS
+from projservo_cli.findings import REFUSES
 from projservo_cli.records import Observation, WorkFailed
 from tests.calibration.simulated_robot import around, random_robot, trials
 from tests.studies.combined_mistakes import bump
@@ -88,8 +90,17 @@ def test_a_large_effect_is_not_usable_until_it_is_accepted():
     np.testing.assert_array_equal(refused.P, accepted.P)
 
 
-def test_every_kind_has_a_usual_size():
-    assert {*model_error._SIZES} == {*DEVIATIONS}
+def test_every_row_of_the_table_is_tested_on_some_fit():
+    """Of joints that turn far, each deviation has a tangent; what monitors name has words."""
+    robot, fitted = random_robot(TYPES, np.random.default_rng(1)), []
+    calibrate(table(robot, gear, 2, 0.0, 7), TYPES, fitted=lambda solution, _: fitted.append(solution))
+    solution = fitted[0]
+    extent = model_error._Extent.of(solution)
+    wide = extent._replace(half=np.full_like(extent.half, np.pi), cycles=np.full_like(extent.half, 3.0))
+    kinds = {one.kind for one in model_error._nuisances(solution.problem, solution.params, wide)}
+    assert kinds == {*DEVIATIONS}
+    assert all(other in DEVIATIONS for row in DEVIATIONS.values() if (other := row.cause))
+    assert all(row.code in words.ROWS and {*row.contains} <= {*CHANGES} for row in CHANGES.values())
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,8 @@ import numpy as np
 
 import projservo_cli as projservo
 from projservo_cli.calibration import predict
-from projservo_cli.findings import DEVIATIONS, NOTE
+from projservo_cli.deviations import DEVIATIONS
+from projservo_cli.findings import NOTE
 from tests.studies.common import in_two_processes, parser_of, written
 from tests.studies.faulty_arms import ARMS, IMAGE, World
 from tests.studies.model_errors import NOISE_PX, inside, poses_of

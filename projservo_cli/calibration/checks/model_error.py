@@ -16,7 +16,7 @@ Biometrika 73, 1986).
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import NamedTuple
 
 import numpy as np
@@ -27,8 +27,22 @@ from projservo_cli.calibration.bundle_adjustment import LeastSquares, minimize
 from projservo_cli.calibration.detections import SAME_READING, Detections, per_rad
 from projservo_cli.calibration.prediction import LENS, Images, Parameters
 from projservo_cli.calibration.robust_fit import Solution
+from projservo_cli.deviations import (
+    ALWAYS,
+    DEVIATIONS,
+    DRIFT,
+    JOINT,
+    PAIR,
+    PAST,
+    PX,
+    READING,
+    SHARE,
+    STEP,
+    Deviation,
+)
 from projservo_cli.findings import LIMITS, Finding, Subject
 from projservo_cli.geometry.displacements import cross_matrix
+from projservo_cli.geometry.joint_curve import OF_READING
 from projservo_cli.records import CORNERS, BoolArray, Errors, FloatArray, IntArray
 
 # Probability of chance above which no nuisance is found.
@@ -49,7 +63,7 @@ _ROUNDS = 2
 _DETECTED = 3.9
 # Standard deviations of a variance ratio above which postures share errors.
 _CORRELATED = 3.9
-# Deviation of an amplitude, in the units of ``_SIZES``, above which the data leave it open.
+# Deviation of an amplitude, in units of its usual size, above which the data leave it open.
 _OPEN = 30.0
 # Minimum number of poses before and after a marker slips, and difference of the shares of rejected images.
 _MIN_SLIP, _SLIPPED = 5, 0.5
@@ -65,30 +79,6 @@ _TERMS, _ROUNDING = 60, 1e-14
 _UNEXPLAINED = 0.2
 # Effect over the stated error from which a nuisance that the data could not have shown is named.
 _UNSHOWN = 2.0
-# Usual sizes of each kind, beyond which none is expected unless it is seen: of scale and coupling a share, of
-# other readings rad (prismatic × 0.3 m/rad), of others the rms motion of the images, px.
-_SIZES: dict[str, float] = {
-    "scale": 0.01,
-    "quadratic": float(np.radians(0.3)),
-    "cubic": float(np.radians(0.3)),
-    "harmonic": float(np.radians(0.5)),
-    "coupling": 0.01,
-    "sag": float(np.radians(0.5)),
-    "joint_drift": float(np.radians(0.2)),
-    "joint_step": float(np.radians(0.2)),
-    "camera_drift": 1.0,
-    "camera_step": 1.0,
-    "base": 1.0,
-    "tool": 1.0,
-    "lens": 2.0,
-    "lens_center": 2.0,
-    "focus": 1.0,
-    "cyclic": float(np.radians(0.2)),
-    "memory": 0.03,
-}
-# Kinds whose amplitude is a motion of the images.
-_OF_IMAGES = ("camera_drift", "camera_step", "base", "tool", "lens", "lens_center", "focus")
-_NO_TIME, _DRIFT, _STEP, _PAST = range(4)
 # Cycles over the range of a joint that are tried, and maximum number for each of its readings that differ.
 _CYCLES, _SHOWN = np.arange(2.0, 16.1, 0.5), 0.25
 
@@ -100,9 +90,14 @@ class _Nuisance(NamedTuple):
     joints: tuple[int, ...]  # from 0
     view: int | None
     columns: FloatArray  # (V, N, 2, d) weighted, by its amplitudes
-    timed: int = _NO_TIME  # whether it drifts or steps over the order of poses, or is of the image before
+    timed: int = ALWAYS  # when it acts
     tag: int | None = None  # of a single tag
     period: float = np.nan  # rad or m, the best of those tried
+
+    @property
+    def row(self) -> Deviation:
+        """Its row of the table."""
+        return DEVIATIONS[self.kind]
 
     @property
     def like(self) -> tuple[str, int, int, bool]:
@@ -112,7 +107,7 @@ class _Nuisance(NamedTuple):
     @property
     def cause(self) -> tuple[str, tuple[int, ...], int | None]:
         """Key of those that have the same cause: a curve of any order, a lens and its centre."""
-        return {"cubic": "quadratic", "lens_center": "lens"}.get(self.kind, self.kind), self.joints, self.view
+        return self.row.cause or self.kind, self.joints, self.view
 
 
 class _Extent(NamedTuple):
@@ -179,7 +174,7 @@ def _nuisances(problem: LeastSquares, params: Parameters, extent: _Extent) -> li
     before = replace(detections, pose_of=np.maximum(detections.pose_of - 1, 0))
     change = replace(problem, detections=before).pixels(params)[0] - images.pixels
     columns = (change * detections.weight[..., None])[..., None]
-    found.append(_Nuisance("memory", (), None, columns, _PAST))
+    found.append(_Nuisance("memory", (), None, columns, PAST))
     center = params.M[:, :3].mean(axis=0)
     rigid = np.zeros((6, 4, 4))
     rigid[:3, :3, :3], rigid[3:, :3, 3] = cross_matrix(np.eye(3)), np.eye(3)
@@ -187,14 +182,14 @@ def _nuisances(problem: LeastSquares, params: Parameters, extent: _Extent) -> li
     for kind, last in (("base", 0), ("tool", -1)):
         motion = np.tensordot(images.points[last], rigid, axes=(1, 2)).swapaxes(1, 2)
         columns = (images.by_point[last] @ motion) * detections.weight[..., None, None]
-        found += [_Nuisance(kind, (), None, columns, timed) for timed in (_DRIFT, _STEP)]
+        found += [_Nuisance(kind, (), None, columns, timed) for timed in DEVIATIONS[kind].times]
     tag_of = detections.marker[detections.marker_of] // CORNERS
     tags, corners = np.unique(detections.marker // CORNERS, return_counts=True)
     tags = tags[corners == CORNERS]
     if 1 < tags.size <= _MAX_TAGS:
         for tag in tags.tolist():
             of_tag = columns * (tag_of == tag)[:, None, None]
-            found.append(_Nuisance("tool", (), None, of_tag, _STEP, tag))
+            found.append(_Nuisance("tool", (), None, of_tag, STEP, tag))
     return found
 
 
@@ -206,29 +201,35 @@ def _of_readings(
     G = images.by_joint(params.H_hat) * detections.weight[..., None, None]
     x, unit, loads = (q - extent.middle) / extent.half, per_rad(params.prismatic), _loads(params, q)
 
-    def of_joint(
-        kind: str, i: int, change: FloatArray, *others: int, timed: int = _NO_TIME, period: float = np.nan
-    ) -> None:
+    def of_joint(kind: str, i: int, change: FloatArray, *others: int, period: float = np.nan) -> None:
         """Add a nuisance that changes readings of joint i by (K, d)."""
         columns = G[..., [i]] * change[detections.pose_of][:, None]
+        (timed,) = DEVIATIONS[kind].times
         found.append(_Nuisance(kind, (*others, i), None, columns, timed, period=period))
 
-    for i in range(n):
-        of_joint("scale", i, q[:, [i]])
-        # About another middle the powers mix, so a curve has its lower orders too.
-        of_joint("quadratic", i, unit[i] * x[:, [i]] ** [1, 2])
-        of_joint("cubic", i, unit[i] * x[:, [i]] ** [1, 2, 3])
-        if not params.prismatic[i]:
-            of_joint("harmonic", i, np.stack([np.sin(q[:, i]), np.cos(q[:, i])], axis=1))
-            of_joint("sag", i, loads[:, i])
-        if np.isfinite(cycles := extent.cycles[i]):
-            waves = np.stack([np.sin(np.pi * cycles * x[:, i]), np.cos(np.pi * cycles * x[:, i])], axis=1)
-            of_joint("cyclic", i, unit[i] * waves, period=2.0 * extent.half[i] / cycles)
-        for j in range(n):
-            if j != i:
-                of_joint("coupling", i, q[:, [j]] * unit[i] / unit[j], j)
-        of_joint("joint_drift", i, np.full((len(q), 1), unit[i]), timed=_DRIFT)
-        of_joint("joint_step", i, np.full((len(q), 1), unit[i]), timed=_STEP)
+    def by_curve(row: Deviation, i: int, by: int) -> FloatArray:
+        """Change (K, d) of the readings of joint i by the functions of a row of those of another."""
+        if "torque" in row.curve:
+            return loads[:, i]
+        if row.unit == SHARE:
+            return np.stack([OF_READING[name](q[:, by]) * unit[i] / unit[by] for name in row.curve], axis=1)
+        # Powers are about the middle of the range; each has its lower ones too.
+        reading = q[:, by] if row.turns else x[:, by]
+        return np.asarray(unit[i] * np.stack([OF_READING[name](reading) for name in row.curve], axis=1))
+
+    for i, (kind, row) in product(range(n), DEVIATIONS.items()):
+        if (row.turns and params.prismatic[i]) or 2.0 * extent.half[i] < row.range_rad:
+            continue
+        if row.curve:
+            for by in [j for j in range(n) if j != i] if row.part == PAIR else [i]:
+                of_joint(kind, i, by_curve(row, i, by), *([by] if by != i else []))
+        elif kind == "cyclic":
+            if np.isfinite(cycles := extent.cycles[i]):
+                angle = np.pi * cycles * x[:, i]
+                waves = np.stack([np.sin(angle), np.cos(angle)], axis=1)
+                of_joint(kind, i, unit[i] * waves, period=2.0 * extent.half[i] / cycles)
+        elif row.part == JOINT:  # a zero that changes with time
+            of_joint(kind, i, np.full((len(q), 1), unit[i]))
     if n > 1:
         columns = G * q[detections.pose_of][:, None]
         found.append(_Nuisance("scale", tuple(range(n)), None, columns))
@@ -243,14 +244,14 @@ def _of_view(
     pixels, depths = problem.pixels(params)
     x = (pixels[v] - extent.center[v]) / extent.radius[v]
 
-    def add(kind: str, change: FloatArray, timed: int = _NO_TIME) -> None:
+    def add(kind: str, change: FloatArray) -> None:
         """Add a nuisance that changes the images by (N, 2, d)."""
         columns = np.zeros((*pixels.shape, change.shape[-1]))
         columns[v] = change * detections.weight[v][:, None, None]
-        found.append(_Nuisance(kind, (), v, columns, timed))
+        found.append(_Nuisance(kind, (), v, columns, *DEVIATIONS[kind].times))
 
-    add("camera_drift", image_motions(x), _DRIFT)
-    add("camera_step", image_motions(x), _STEP)
+    add("camera_drift", image_motions(x))
+    add("camera_step", image_motions(x))
     if images.by_lens is None:
         square = (x**2).sum(axis=1)[:, None, None]
         add("lens", x[..., None] * np.concatenate([square, square**2], axis=2))
@@ -327,13 +328,13 @@ class _Tests:
         self.Z = np.empty((len(r), int(self.parts[-1])))
         for number, one in enumerate(nuisances):
             columns = whitened((one.columns * used[..., None, None]).reshape(2 * used.size, -1))
-            self.units.append(_unit(one.kind, columns))
+            self.units.append(_unit(one.row, columns))
             self.Z[:, self.part(number)] = columns @ self.units[-1]
-            if one.timed == _DRIFT:
-                self.Z[:, self.part(number)] *= self._over_rows(_DRIFT, 0)
+            if one.timed == DRIFT:
+                self.Z[:, self.part(number)] *= self._over_rows(DRIFT, 0)
         self.nuisances = [one._replace(columns=np.zeros(0)) for one in nuisances]  # as large again
         self.W = self.U.T @ self.Z  # (p, c)
-        self.steps = [number for number, one in enumerate(nuisances) if one.timed == _STEP]
+        self.steps = [number for number, one in enumerate(nuisances) if one.timed == STEP]
         self.grams = self._grams()
         self.Q = np.zeros((len(r), 0))  # orthonormal columns of the nuisances chosen
         self.periods = False  # whether what repeats over a joint is a candidate
@@ -367,7 +368,7 @@ class _Tests:
     def columns(self, choice: _Choice) -> FloatArray:
         """Columns (L, d) of a nuisance in units of its usual size."""
         own = self.Z[:, self.part(choice.number)]
-        return own * self._over_rows(_STEP, choice.onset) if choice.number in self.steps else own
+        return own * self._over_rows(STEP, choice.onset) if choice.number in self.steps else own
 
     def cleared(self, columns: FloatArray) -> FloatArray:
         """Columns (L, d) cleared of the parameters and of the nuisances chosen."""
@@ -399,7 +400,7 @@ class _Tests:
         plain = [
             number
             for number, one in enumerate(self.nuisances)
-            if one.timed != _STEP and (self.periods or one.kind != "cyclic")
+            if one.timed != STEP and (self.periods or one.kind != "cyclic")
         ]
         s, W = self.Z.T @ self.r, self.Q.T @ self.Z
         found = []
@@ -515,19 +516,18 @@ class _Tests:
         return None
 
 
-def _unit(kind: str, Z: FloatArray) -> FloatArray:
-    """Amplitudes (d, d) of the usual size of a kind, for columns (L, d): of the images by their rms."""
-    size: float = _SIZES[kind]
-    if kind not in _OF_IMAGES:
-        return size * np.eye(Z.shape[1])
+def _unit(row: Deviation, Z: FloatArray) -> FloatArray:
+    """Amplitudes (d, d) of the usual size of a deviation, for columns (L, d): of the images by their rms."""
+    if row.unit != PX:
+        return row.size * np.eye(Z.shape[1])
     count = max(int(np.count_nonzero(np.abs(Z).max(axis=1))), 1)
     values, basis = np.linalg.eigh(Z.T @ Z / count)
-    return np.asarray(size * basis / np.sqrt(np.maximum(values, 1e-12 * values[-1] + 1e-300)))
+    return np.asarray(row.size * basis / np.sqrt(np.maximum(values, 1e-12 * values[-1] + 1e-300)))
 
 
 def _over_time(timed: int, poses: int, onset: int) -> FloatArray:
     """Amplitudes (K,) over the poses of a drift, from −½ to ½, or of a step at a pose."""
-    if timed == _DRIFT:
+    if timed == DRIFT:
         return np.linspace(-0.5, 0.5, poses)
     return (np.arange(poses) >= onset).astype(np.float64)
 
@@ -642,12 +642,12 @@ def stepped(solution: Solution, onset: int) -> Finding | None:
     weight = np.repeat(detections.weight.ravel(), 2)[rows].clip(1e-300)
     best, left = None, _UNEXPLAINED * float(off @ off)
     for one in _nuisances(plain, params, _Extent.of(solution)):
-        if one.timed != _STEP:
+        if one.timed != STEP:
             continue
         Z = one.columns.reshape(len(rows), -1)[rows]
         b = np.linalg.lstsq(Z, off)[0]
         if (square := float(np.square(off - Z @ b).sum())) < left:
-            size = float(np.sqrt(np.mean((Z @ b / weight) ** 2)) if one.kind in _OF_IMAGES else -b[0])
+            size = float(np.sqrt(np.mean((Z @ b / weight) ** 2)) if one.row.unit == PX else -b[0])
             left = square
             best = _finding(one, detections, size, 0.0, abs(size), int(detections.pose[onset]))
     return best
@@ -676,7 +676,7 @@ def _slipped_tags(solution: Solution) -> tuple[list[Finding], float]:
         effect = off * float(np.sqrt(at_end / number.size))
         square += effect**2
         spread = off / float(np.sqrt(np.count_nonzero(rows)))
-        moved = _Nuisance("tool", (), None, np.zeros(0), _STEP, int(tag))
+        moved = _Nuisance("tool", (), None, np.zeros(0), STEP, int(tag))
         found.append(_finding(moved, detections, off, spread, effect, int(detections.pose[onset])))
     return found, float(np.sqrt(square))
 
@@ -733,7 +733,7 @@ class _Effects:
         """The same, of which the fit absorbs a part (rows, d)."""
         one = self.there[number]
         columns = one.columns.reshape(len(self.rows), -1)[self.rows] @ self.tests.units[number]
-        share = {_DRIFT: 0.5, _PAST: 0.0}.get(one.timed, 1.0)  # at rest, images are of nothing before
+        share = {DRIFT: 0.5, PAST: 0.0}.get(one.timed, 1.0)  # at rest, images are of nothing before
         return np.asarray(share * columns - absorbed)
 
     def rms(self, change: FloatArray) -> float:
@@ -745,7 +745,7 @@ class _Effects:
         worst: tuple[float, int, FloatArray] | None = None
         absorbed = self.T @ self.tests.W
         for number, one in enumerate(self.tests.nuisances):
-            if number in found or one.timed != _NO_TIME or (one.kind == "scale" and len(one.joints) > 1):
+            if number in found or one.timed != ALWAYS or (one.kind == "scale" and len(one.joints) > 1):
                 continue
             values, basis = np.linalg.eigh(self.tests.grams[number] / (_DETECTED * sigma_px) ** 2)
             root = basis / np.sqrt(1.0 + np.maximum(values, 0.0))
@@ -767,10 +767,10 @@ def _described(
     one, length = tests.nuisances[number], max(float(np.linalg.norm(b)), 1e-300)
     sign = -1.0 if (len(b) == 1 or one.kind == "scale") and (b < 0.0).all() else 1.0
     deviation = float(np.sqrt(max(float(b @ covariance @ b), 0.0))) / length
-    size = _SIZES[one.kind]
+    size = one.row.size
     if one.kind == "scale":  # of several joints the root mean square
         size /= np.sqrt(len(one.joints))
-    if one.kind in _OF_IMAGES:  # px as seen
+    if one.row.unit == PX:  # px as seen
         size /= tests.weight[-1 if one.view is None else one.view]
     return _finding(one, tests.detections, sign * size * length, size * deviation, effect, first)
 
@@ -779,8 +779,8 @@ def _finding(
     one: _Nuisance, detections: Detections, size: float, deviation: float, effect: float, first: int | None
 ) -> Finding:
     """Finding on a nuisance: its size, a share, rad (prismatic × 0.3 m/rad) or px, and its effect, px."""
-    unit, factor = ("px" if one.kind in _OF_IMAGES else "1"), 1.0
-    if one.joints and one.kind not in ("scale", "coupling"):
+    unit, factor = one.row.unit, 1.0
+    if unit == READING:
         i = one.joints[-1]
         unit, factor = detections.units[i], float(per_rad(detections.prismatic)[i])
     subject = Subject(
