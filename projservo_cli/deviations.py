@@ -46,6 +46,8 @@ ARGUMENTS = {
     "sine": "sine of reading {}",
     "versine": "1 − cosine of reading {}",
     "torque": "torque, of which the largest is 1",
+    "sine of twice": "sine of twice reading {}",
+    "versine of twice": "1 − cosine of twice reading {}",
 }
 BASIS = tuple(ARGUMENTS)
 _DEGREE = math.radians(1.0)
@@ -54,6 +56,12 @@ DEVIATIONS = {
     "quadratic": Deviation(JOINT, READING, 0.3 * _DEGREE, curve=("linear", "square")),
     "cubic": Deviation(JOINT, READING, 0.3 * _DEGREE, curve=("linear", "square", "cube"), cause="quadratic"),
     "harmonic": Deviation(JOINT, READING, 0.5 * _DEGREE, curve=("sine", "versine"), turns=True),
+    "second_harmonic": Deviation(
+        *(JOINT, READING, 0.5 * _DEGREE),
+        curve=("sine of twice", "versine of twice"),
+        turns=True,
+        range_rad=math.pi,  # of less it is a cubic
+    ),
     "coupling": Deviation(PAIR, SHARE, 0.01, curve=("linear",)),
     "sag": Deviation(JOINT, READING, 0.5 * _DEGREE, curve=("torque",), turns=True),
     "cyclic": Deviation(JOINT, READING, 0.2 * _DEGREE),

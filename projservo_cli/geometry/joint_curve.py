@@ -14,8 +14,8 @@ from projservo_cli.records import BoolArray, FloatArray, JointCurve, Model
 
 # Step of the differences by which a curve is differentiated, rad or m: third derivatives leave 1e-11 of it.
 _STEP = 1e-5
-_SQUARE, _CUBE, _SINE, _VERSINE, _TORQUE = map(BASIS.index, ("square", "cube", "sine", "versine", "torque"))
-_EVEN = [_SQUARE, _VERSINE]
+_SQUARE, _CUBE, _SINE, _VERSINE, _TORQUE, _SINE_OF_TWICE, _VERSINE_OF_TWICE = range(1, len(BASIS))
+_EVEN = [_SQUARE, _VERSINE, _VERSINE_OF_TWICE]
 # Functions of a reading from the reference, rad or m; a torque is one of all readings.
 OF_READING: dict[str, Callable[[FloatArray], FloatArray]] = {
     "linear": lambda x: x,
@@ -23,6 +23,8 @@ OF_READING: dict[str, Callable[[FloatArray], FloatArray]] = {
     "cube": lambda x: x**3,
     "sine": np.sin,
     "versine": lambda x: 2.0 * np.sin(0.5 * x) ** 2,
+    "sine of twice": lambda x: np.sin(2.0 * x),
+    "versine of twice": lambda x: 2.0 * np.sin(x) ** 2,
 }
 
 
@@ -117,6 +119,10 @@ def _value_and_slope(kind: int, x: float) -> tuple[float, float]:
     if kind == _VERSINE:
         half = math.sin(0.5 * x)
         return 2.0 * half * half, math.sin(x)
+    if kind == _SINE_OF_TWICE:
+        return math.sin(2.0 * x), 2.0 * math.cos(2.0 * x)
+    if kind == _VERSINE_OF_TWICE:
+        return 2.0 * math.sin(x) ** 2, 2.0 * math.sin(2.0 * x)
     return x, 1.0
 
 

@@ -17,6 +17,9 @@ OF_MODEL = {
     "harmonic": Row(
         "readings of {joints} swing by {size} once a turn", _CURVE, limit="eccentric encoder of {joints}"
     ),
+    "second_harmonic": Row(
+        "readings of {joints} swing by {size} twice a turn", _CURVE, limit="oval gear of {joints}"
+    ),
     "coupling": Row(
         "joint {of[0]} turns joint {of[1]} by {size} of its motion", _CURVE, limit="coupling of {joints}"
     ),

@@ -117,6 +117,25 @@ def bent(robot, q):
     return theta
 
 
+def test_an_error_twice_a_turn_is_named_fitted_and_predicted():
+    """Of a joint that turns through more than half a turn; the curve halves what poses ahead err by."""
+    rng = np.random.default_rng(5)
+    robot = random_robot("RRRR", rng, markers=9)
+
+    def oval(q):
+        return q + np.radians(0.25) * np.sin(2.0 * (q - robot.q_reference) + 0.7) * np.eye(4)[2]
+
+    q, ahead = (around(robot, count, rng, np.radians(100.0)) for count in (40, 60))
+    seen = dataclasses.replace(robot.observe(oval(q), SIGMA, rng), q=q)
+    plain, fitted = (calibrate(seen, "RRRR", source="recorded", joint_model=one) for one in (None, "auto"))
+    assert ("second_harmonic", (3,)) in [(one.code, one.subject.joints) for one in plain.findings]
+    terms = [BASIS[int(kind)] for kind in fitted.joint_curve[:, 0]]
+    assert terms == ["sine of twice", "versine of twice"]
+    np.testing.assert_array_less(np.abs(fitted.joint_curve[:, 1] - 3.0), 0.5)
+    off = [np.nanmedian(np.abs(predict(one, ahead) - robot.images(oval(ahead)))) for one in (plain, fitted)]
+    assert off[1] < 0.5 * off[0]
+
+
 @pytest.fixture(scope="module", params=["world", "tool"])
 def case(request):
     """Arm, poses to predict, its images, and calibrations without a curve, by choice, and as asked for."""

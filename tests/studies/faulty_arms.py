@@ -227,7 +227,8 @@ def faults_of(arm):
     every, late = tuple(i + 1 for i, kind in enumerate(arm.types) if kind == "R"), partial(steps, at=0.8)
     moves, left = partial(partial, move), {(kind, None, "left") for kind in ("camera_drift", "camera_step")}
     subsets = [some for count in range(1, 7) for some in itertools.combinations(every, count)]
-    curved = {(kind, (e,), None) for kind in ("harmonic", "quadratic", "cubic")}  # no kind has two waves
+    waves = ("second_harmonic", "harmonic", "quadratic", "cubic")  # a short stretch of two waves is a cubic
+    curved = {(kind, (e,), None) for kind in waves}
     return {
         "gear": (partial(curve, joints=(e,)), {("scale", (e,), None)}),
         "gear all": (partial(curve, joints=every), {("scale", some, None) for some in subsets}),
