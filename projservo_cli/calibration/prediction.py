@@ -94,6 +94,24 @@ class Images(NamedTuple):
         by_joint = self.by_true_joint(H_hat)
         return by_joint if self.slopes is None else np.asarray(by_joint @ self.slopes)
 
+    def by_motion(self, generators: FloatArray, behind: int) -> FloatArray:
+        """Derivative (V, N, 2, d) by motions (d, 4, 4) of what is behind a joint: 0 the base, −1 the tool."""
+        velocity = np.einsum("dab,Nb->Nad", generators, self.points[behind])
+        return np.asarray(self.by_point[behind] @ velocity)
+
+    def of_own_poses(self) -> "Images":
+        """Images of all markers by each view at a pose of its own, of as many poses as views: (1, N)."""
+        V, N = self.pixels.shape[:2]
+        own = np.repeat(np.arange(V), N // V), np.arange(N)
+        return Images(
+            pixels=self.pixels[own][None],
+            points=self.points,
+            by_camera=self.by_camera[own][None],
+            by_point=self.by_point[:, *own][:, None],
+            by_lens=None if self.by_lens is None else self.by_lens[own][None],
+            slopes=self.slopes,
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class Parameters:

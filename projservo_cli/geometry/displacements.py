@@ -150,6 +150,14 @@ def cross_matrix(w: FloatArray) -> FloatArray:
     return (columns - columns.swapaxes(-1, -2)).swapaxes(-1, -2)
 
 
+def generators(linear: FloatArray, center: FloatArray) -> FloatArray:
+    """Generators (3 + j, 4, 4) of translations, and of linear maps (j, 3, 3) about a point (3,)."""
+    E = np.zeros((3 + len(linear), 4, 4))
+    E[range(3), range(3), 3] = 1.0
+    E[3:, :3, :3], E[3:, :3, 3] = linear, -linear @ center
+    return E
+
+
 def twists(axes: FloatArray) -> FloatArray:
     """Twists (…, 4, 4) of screws (…, 6)."""
     result = np.zeros((*axes.shape[:-1], 4, 4))

@@ -10,6 +10,7 @@ from scipy.special import chdtri
 from projservo_cli.calibration.detections import MIN_SIGMA, per_rad
 from projservo_cli.calibration.prediction import (
     CAMERA,
+    Images,
     Parameters,
     dense_pixel_changes,
     errors_of,
@@ -175,10 +176,7 @@ class ErrorModel:
         noise = pair.noise * np.sqrt(self._corner_variance(away))
         at = scene.everywhere(away)
         B = dense_pixel_changes(scene, self.errors, away, at)[views, views]
-        D = at.by_point.reshape(n + 1, V, V, m, 2, 4)[:, views, views]
-        Y = at.points.reshape(n + 1, V, m, 4)
-        by_camera = at.by_camera.reshape(V, V, m, 2, CAMERA)[views, views]
-        F = self._fault_derivative(D, Y, by_camera, pair, at.slopes)
+        F = self._fault_derivative(at.of_own_poses(), pair)
         for part in (r, B, F):
             part[~seen] = 0.0
         F = F.reshape(rows, -1)
@@ -224,28 +222,15 @@ class ErrorModel:
                 sides.append(ray)
         return len(sides)
 
-    def _fault_derivative(
-        self,
-        D: FloatArray,
-        Y: FloatArray,
-        by_camera: FloatArray,
-        pair: FramePair,
-        slopes: FloatArray | None,
-    ) -> FloatArray:
-        """Derivatives (V, m, 2, f) of pixels by what may be wrong, in the order of ``_directions_of``.
-
-        D : (n + 1, V, m, 2, 4) by the points Y (n + 1, V, m, 4) behind each joint; by_camera : (V, m, 2, 12);
-        slopes : (V m, n, n) of true joints by readings, None where they are equal.
-        """
-        n, V, m = Y[1:, ..., 0].shape
-        F, d = np.zeros((V, m, 2, self.f)), len(self.twists)
-        velocity = Y[:n] @ self.scene.H_hat[:, None].swapaxes(2, 3)
-        J_q = np.moveaxis((D[:n] @ velocity[..., None])[..., 0], 0, -1)
-        if slopes is not None:
-            J_q = J_q @ slopes.reshape(V, m, n, n)
+    def _fault_derivative(self, at: Images, pair: FramePair) -> FloatArray:
+        """Derivatives (V, m, 2, f) of pixels by what may be wrong, in the order of ``_directions_of``."""
+        (V, n), m, d = pair.q.shape, len(self.scene.M), len(self.twists)
+        F = np.zeros((V, m, 2, self.f))
+        J_q = at.by_joint(self.scene.H_hat).reshape(V, m, 2, n)
         J_q = -J_q[..., ::-1] if self.calibration.mount == TOOL else J_q
         F[..., :n], F[..., n : 2 * n] = J_q, J_q * pair.t[:, None, None, None]
-        by_marker, first = D[n] @ self.directions.T, self.fixed
+        by_marker, first = (at.by_point[n] @ self.directions.T).reshape(V, m, 2, 3), self.fixed
+        by_camera = at.by_camera.reshape(V, m, 2, CAMERA)
         for v in range(V):
             F[v, ..., 2 * n + v] = -J_q[v] @ pair.q_dot[v]
             F[v, ..., first : first + CAMERA - 1] = by_camera[v] @ self.cameras[v]
@@ -253,8 +238,8 @@ class ErrorModel:
         for j in range(m):
             F[:, j, :, first : first + 3] = by_marker[:, j]
             first += 3
-        F[..., first : first + d] = D[n] @ np.moveaxis(self.scene.M @ self.twists.swapaxes(1, 2), 0, -1)
-        F[..., first + d :] = D[0] @ np.moveaxis(Y[0] @ self.twists[:, None].swapaxes(2, 3), 0, -1)
+        F[..., first : first + d] = at.by_motion(self.twists, -1).reshape(V, m, 2, d)
+        F[..., first + d :] = at.by_motion(self.twists, 0).reshape(V, m, 2, d)
         return F
 
     def sums(self, residual: Residual, t: float) -> Sums:

@@ -20,7 +20,7 @@ from scipy.special import chdtri
 
 from projservo_cli.calibration.prediction import require_covariance
 from projservo_cli.findings import REFUSES, Finding, Subject
-from projservo_cli.geometry.displacements import homogeneous
+from projservo_cli.geometry.displacements import generators, homogeneous
 from projservo_cli.geometry.lens import undistort
 from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.metric.frame import Metric, changes_of
@@ -34,7 +34,7 @@ from projservo_cli.records import (
     IntArray,
     WorkFailed,
 )
-from projservo_cli.task.look_bundle import Bundle, BundleFit, Look, LookRig, differ, generators, unknown
+from projservo_cli.task.look_bundle import Bundle, BundleFit, Look, LookRig, differ, unknown
 
 # Number of markers that six coordinates need, and that twelve need; findings on it by these numbers.
 RIGID, _AFFINE = 3, 4

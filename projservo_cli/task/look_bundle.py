@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from projservo_cli.calibration.prediction import error_factor_with_model, projection_derivative
 from projservo_cli.findings import REFUSES, Finding
-from projservo_cli.geometry.displacements import cross_matrix
+from projservo_cli.geometry.displacements import cross_matrix, generators
 from projservo_cli.geometry.lens import distort, undistort
 from projservo_cli.metric.frame import ProjectiveParameters, changes_of, invariant_form
 from projservo_cli.records import BoolArray, Calibration, FloatArray, WorkFailed
@@ -129,14 +129,6 @@ def _metric_root(L: FloatArray) -> FloatArray | None:
         return None
     back = np.linalg.inv(A[0])
     return A if np.linalg.norm(changes_of(back @ S @ back.T)) < _UNDETERMINED else None
-
-
-def generators(linear: FloatArray, center: FloatArray) -> FloatArray:
-    """Generators (3 + j, 4, 4) of translations, and of linear maps (j, 3, 3) about a point (3,)."""
-    E = np.zeros((3 + len(linear), 4, 4))
-    E[range(3), range(3), 3] = 1.0
-    E[3:, :3, :3], E[3:, :3, 3] = linear, -linear @ center
-    return E
 
 
 class Bundle(NamedTuple):

@@ -41,7 +41,7 @@ from projservo_cli.deviations import (
     Deviation,
 )
 from projservo_cli.findings import LIMITS, Finding, Subject
-from projservo_cli.geometry.displacements import cross_matrix
+from projservo_cli.geometry.displacements import cross_matrix, generators
 from projservo_cli.geometry.joint_curve import OF_READING
 from projservo_cli.records import CORNERS, BoolArray, Errors, FloatArray, IntArray
 
@@ -175,13 +175,9 @@ def _nuisances(problem: LeastSquares, params: Parameters, extent: _Extent) -> li
     change = replace(problem, detections=before).pixels(params)[0] - images.pixels
     columns = (change * detections.weight[..., None])[..., None]
     found.append(_Nuisance("memory", (), None, columns, PAST))
-    center = params.M[:, :3].mean(axis=0)
-    rigid = np.zeros((6, 4, 4))
-    rigid[:3, :3, :3], rigid[3:, :3, 3] = cross_matrix(np.eye(3)), np.eye(3)
-    rigid[:3, :3, 3] = -(rigid[:3, :3, :3] @ center)
-    for kind, last in (("base", 0), ("tool", -1)):
-        motion = np.tensordot(images.points[last], rigid, axes=(1, 2)).swapaxes(1, 2)
-        columns = (images.by_point[last] @ motion) * detections.weight[..., None, None]
+    rigid = generators(cross_matrix(np.eye(3)), params.M[:, :3].mean(axis=0))
+    for kind, behind in (("base", 0), ("tool", -1)):
+        columns = images.by_motion(rigid, behind) * detections.weight[..., None, None]
         found += [_Nuisance(kind, (), None, columns, timed) for timed in DEVIATIONS[kind].times]
     tag_of = detections.marker[detections.marker_of] // CORNERS
     tags, corners = np.unique(detections.marker // CORNERS, return_counts=True)
