@@ -190,18 +190,17 @@ class Evidence:
         kind, changed = fit.cause.kind, fit.cause.change(self.nothing, fit.theta)
         if kind not in ("exchanged", "mirrored", "slipped", "sized") or fit.changed_px < _NEAR_PX:
             return fit
-        pairs = []
-        for pair, away in zip(self.pairs, changed.away, strict=True):
-            images, noise = pair.images, pair.noise
-            if kind == "exchanged":
-                order = np.argsort(fit.cause.views)
-                images, noise = images[order], noise[order]
+        # What each view shows as it was calibrated: of an exchange another one, of other markers.
+        order = np.argsort(fit.cause.views) if kind == "exchanged" else np.arange(self.seen.shape[1])
+        pairs, seen_there = [], self.seen[:, order]
+        for pair, seen, away in zip(self.pairs, seen_there, changed.away, strict=True):
+            images, noise = np.where(seen[..., None], pair.images[order], np.nan), pair.noise[order]
             images = (images - changed.shift[:, None] + 0.5) / changed.scale[:, None, None] - 0.5
             noise = noise / changed.scale[:, None]
             q = away + self.q_reference
             pairs.append(pair._replace(q=q, images=images, noise=noise))
         residuals = [self._errors.residual(pair) for pair in pairs]
-        if any((there.seen != seen).any() for there, seen in zip(residuals, self.seen, strict=True)):
+        if any((there.seen != seen).any() for there, seen in zip(residuals, seen_there, strict=True)):
             return fit  # a point behind a camera has no prediction: there is no state to go back to
         there = Evidence(self._errors, pairs, residuals, self._weights, self._agreed)
         left, theta = there.before, fit.theta
@@ -267,7 +266,7 @@ class Evidence:
         shift = self.at_first - here
         change = np.square(shift).reshape(*self.seen.shape, 2).sum(axis=-1)
         changed_px = float(np.sqrt(change[change > 0.0].mean())) if change.any() else 0.0
-        share = float((self.at_first * shift).sum() / max(float(change.sum()), 1e-12))
+        share = abs(float((self.at_first * shift).sum())) / max(float(change.sum()), 1e-12)
         by_view = change.sum(axis=(0, 2)) / np.maximum(self._touched(cause).sum(axis=(0, 2)), 1)
         return Explanation(
             cause=cause,

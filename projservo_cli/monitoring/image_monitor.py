@@ -7,6 +7,7 @@ import numpy as np
 
 from projservo_cli.calibration.detections import even_choice
 from projservo_cli.calibration.prediction import CAMERA
+from projservo_cli.deviations import MARKERS
 from projservo_cli.findings import REFUSES, Finding, Subject
 from projservo_cli.monitoring.accuracy import Posture
 from projservo_cli.monitoring.causes import finding_of, group_of, is_slight, misplaced_tags
@@ -501,11 +502,14 @@ class ImageMonitor:
     def _finding(self, fits: list[Explanation]) -> Finding:
         """Return the fault with the likeliest of causes."""
         pair, residual = self._kept[-1][:2]
-        if misplaced := misplaced_tags(pair.images, residual.predicted, self.calibration.marker):
+        explained, numbers = self._explains(fits[0]), self.calibration.marker
+        # What moves all images may show a tag where another one was.
+        by_itself = not explained or fits[0].cause.row.part == MARKERS
+        if by_itself and (misplaced := misplaced_tags(pair.images, residual.predicted, numbers)):
             return Finding("misplaced_tags", REFUSES, others=misplaced)
         square = np.square(residual.r).reshape(len(residual.seen), -1).sum(axis=1)
         rms = np.sqrt(square / np.maximum(residual.seen.sum(axis=1), 1)).max()  # of the view that is most off
-        if not self._explains(fits[0]):
+        if not explained:
             off, where = float(rms), self._where(residual)
             return Finding("unexplained_images", REFUSES, where, off, unit="px")
         # A mirrored reading near zero is a small slip: with backlash, images do not separate them.

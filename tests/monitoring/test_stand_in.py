@@ -43,3 +43,17 @@ def test_tags_that_are_bent_in_one_posture_are_no_fault_and_hide_no_camera(bent,
     known = calibrated(rig)
     fault = fault_at_rest(known, Observation.of_one(np.arange(20), q, s, known.view), size)
     assert (fault and (fault.others or (fault,))[0].code) == named
+
+
+@pytest.mark.parametrize(
+    ("rig", "number", "level"),
+    [
+        (Rig("six", "finder", 0.0, 0.08), 20025, ("exchange",)),  # each view shows other markers
+        (Rig("five", "none", 0.3, 0.08), 40003, ("home", 1, 15.0)),  # a tag comes to where another one was
+        (Rig("five", "jpeg", 0.3, 0.0), 30036, ("sign", 6)),
+    ],
+    ids=["exchange", "home", "sign"],
+)
+def test_what_moves_all_images_is_named_before_what_moves_some(rig, number, level):
+    (row,) = driven((rig, [("faults", number, level)]))
+    assert row["judged"] in ("right", "pair"), row["reason"]
