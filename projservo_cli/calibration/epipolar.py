@@ -15,7 +15,7 @@ from scipy.optimize import least_squares, minimize_scalar
 from scipy.spatial.transform import Rotation
 from scipy.special import stdtrit
 
-from projservo_cli.calibration.detections import Detections, deviation, medians
+from projservo_cli.calibration.detections import Detections, deviation, even_choice, medians
 from projservo_cli.geometry.displacements import homogeneous
 from projservo_cli.image_size import ImageSize, image_sizes
 from projservo_cli.records import BoolArray, FloatArray, IntArray, WorkFailed
@@ -52,6 +52,8 @@ _EXACT = 1e-4
 _WHITENINGS = 30
 # Maximum number of markers a pose of which all pairs are compared.
 _PAIRED = 20
+# Maximum number of poses whose distances are compared.
+_COMPARED = 200
 # Minimum focal length tried, in image sizes, as in the centre of a fisheye.
 _SHORTEST = 0.4
 # Maximum focal length tried, in image sizes: a long lens, with the extent of the data as the image size.
@@ -400,14 +402,13 @@ def metric_guesses(
 
     Raises WorkFailed if no two markers were seen together at two poses.
     """
-    both = detections.both
-    pairs = marker_pairs(detections.pose_of[both], detections.marker_of[both])
+    some, pairs = _compared(detections)
 
-    def guess(log_focal: float, factor: float) -> tuple[FloatArray, FloatArray]:
+    def guess(detections: Detections, log_focal: float, factor: float) -> tuple[FloatArray, FloatArray]:
         return _guess_at(epipolar.F, detections, frame, factor * float(np.exp(log_focal)))
 
     def spread_at(log_focal: float) -> float:
-        return _distance_spread(guess(log_focal, 1.0)[1], pairs)
+        return _distance_spread(guess(some, log_focal, 1.0)[1], pairs)
 
     grid = np.linspace(np.log(_SHORTEST), np.log(_LONGEST), _TRIALS)
     spread = np.array([spread_at(x) for x in grid])
@@ -423,7 +424,7 @@ def metric_guesses(
     for i in minima:
         bounds = float(grid[i]) - step, float(grid[i]) + step
         fine = minimize_scalar(spread_at, bounds=bounds, method="bounded", options={"xatol": _FINE * step})
-        guesses.append(guess(fine.x if fine.fun < spread[i] else grid[i], factor))
+        guesses.append(guess(detections, fine.x if fine.fun < spread[i] else grid[i], factor))
     return guesses
 
 
@@ -460,6 +461,18 @@ def _ray_depths(R: FloatArray, t: FloatArray, x: FloatArray, y: FloatArray) -> t
     xt, yt = Rx @ t, y @ t
     determinant = np.maximum(xx * yy - xy**2, 1e-15 * xx * yy)
     return (xy * yt - yy * xt) / determinant, (xx * yt - xy * xt) / determinant
+
+
+def _compared(detections: Detections) -> tuple[Detections, tuple[IntArray, IntArray, IntArray]]:
+    """Detections at evenly spaced poses, and their pairs of markers; all where a pair is not seen again."""
+    K = len(detections.q)
+    some = detections.of_poses(np.isin(np.arange(K), even_choice(K, _COMPARED)))
+    if some.both.any():
+        pairs = marker_pairs(some.pose_of[some.both], some.marker_of[some.both])
+        if np.bincount(pairs[2]).max(initial=0) > 1:
+            return some, pairs
+    both = detections.both
+    return detections, marker_pairs(detections.pose_of[both], detections.marker_of[both])
 
 
 def marker_pairs(pose_of: IntArray, marker_of: IntArray) -> tuple[IntArray, IntArray, IntArray]:

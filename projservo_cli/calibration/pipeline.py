@@ -53,6 +53,7 @@ from projservo_cli.calibration.robust_fit import (
     Expected,
     Misfit,
     Solution,
+    fewer,
     fit_joint_noise,
     solve,
 )
@@ -273,7 +274,7 @@ def _maximum_likelihood(
     search, epipolar, (lens, init, curves), curved = start, start.epipolar, asked, None
     expected = expect(epipolar)
     try:
-        solution, note = solve(start, expected, init)
+        solution, note = solve(start if len(whole.view) <= 2 or init else fewer(start), expected, init)
         if len(whole.view) > 2:
             solution = with_own_noise(with_all_views(solution, whole, epipolar), epipolar)[0]
             search = dataclasses.replace(start, problem=solution.problem, frame=frame)

@@ -51,6 +51,8 @@ _AT_ONCE = 2**21
 _MAX_CORNERS = 50_000
 # Maximum number of detections by which a fit is assessed, and minimum number of markers.
 _MAX_JUDGED_DETECTIONS, _MIN_JUDGED = 40_000, 8
+# Number of markers at each pose with which the robust search of more detections is done.
+_SEARCHED = 12
 # Maximum number of rounds in which inliers are selected.
 _MASK_ROUNDS = 4
 # Share of observations that are wrong above which whole tracks are tested.
@@ -408,9 +410,35 @@ def _stall_check(seen: BoolArray, far: float) -> Callable[[FloatArray], bool]:
 
 
 def fit_from(problem: LeastSquares, params: Parameters, epipolar: ImageGeometry) -> Solution | None:
-    """Fit from initial parameters, by a robust search and ``fit_inliers``; None if it fails."""
-    searched, level = _robust_search(problem, params, problem.detections.seen, epipolar)
+    """Fit from initial parameters, by a robust search and ``fit_inliers``; None if it fails.
+
+    Of many detections some markers are searched with; the others are placed by what is found.
+    """
+    few = _searched_markers(problem.detections, np.isfinite(params.M[:, 0]))
+    some, smaller = _of_markers(problem, params, few)
+    searched, level = _robust_search(some, smaller, some.detections.seen, epipolar)
+    M = np.full((few.size, 4), np.nan)
+    M[few] = searched.M
+    searched = dataclasses.replace(searched, M=M)
     return fit_inliers(problem, searched, level / RAYLEIGH, epipolar.noise_px, hopeless=_HOPELESS)
+
+
+def fewer(search: Search) -> Search:
+    """Search with some markers of many detections."""
+    detections = search.problem.detections
+    few = _searched_markers(detections, np.ones(detections.marker.size, dtype=np.bool_))
+    return dataclasses.replace(search, problem=search.problem.of_markers(few))
+
+
+def _searched_markers(detections: Detections, placed: BoolArray) -> BoolArray:
+    """Mask (m,) of markers to search with: all, or of many detections as many placed ones as a pose needs."""
+    every = np.ones(detections.marker.size, dtype=np.bool_)
+    if detections.seen.sum() <= _MAX_JUDGED_DETECTIONS:
+        return every
+    order = np.argsort(-detections.count_of(detections.seen), kind="stable")
+    few = detections.covering(order[placed[order]], _SEARCHED)
+    kept = (detections.seen & few[detections.marker_of]).sum(axis=1)
+    return few if (kept >= 0.5 * few.mean() * detections.seen.sum(axis=1)).all() else every
 
 
 def _robust_search(

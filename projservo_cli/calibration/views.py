@@ -9,7 +9,13 @@ from itertools import combinations
 import numpy as np
 
 from projservo_cli.calibration.bundle_adjustment import LeastSquares
-from projservo_cli.calibration.detections import RAYLEIGH, Detections, cauchy_weights, deviation
+from projservo_cli.calibration.detections import (
+    RAYLEIGH,
+    Detections,
+    cauchy_weights,
+    deviation,
+    even_choice,
+)
 from projservo_cli.calibration.epipolar import Epipolar, ImageGeometry, similarity
 from projservo_cli.calibration.lens_estimation import undistorted
 from projservo_cli.calibration.robust_fit import Solution, fit_from, fit_inliers
@@ -19,6 +25,8 @@ from projservo_cli.records import FloatArray, WorkFailed
 
 # Number of points that determine a camera, and of random samples of them.
 _MINIMAL, _SAMPLES = 6, 300
+# Maximum number of points by which samples are compared.
+_JUDGES = 2000
 # Rounds of reweighting in a resection, and of the noise of each view.
 _ROUNDS, _NOISE_ROUNDS = 10, 6
 # Relative change of the noise of each view that ends these rounds.
@@ -135,8 +143,8 @@ def resected(points: FloatArray, pixels: FloatArray) -> FloatArray:
     T, U = similarity(pixels), similarity(X)
     x, X = homogeneous(pixels) @ T.T, homogeneous(X) @ U.T
     picks = np.stack([rng.choice(len(x), _MINIMAL, replace=False) for _ in range(_SAMPLES)])
-    candidates = _linear(X[picks], x[picks])
-    medians = np.nanmedian(np.linalg.norm(_off(candidates, X, x), axis=-1), axis=-1)
+    candidates, some = _linear(X[picks], x[picks]), even_choice(len(x), _JUDGES)
+    medians = np.nanmedian(np.linalg.norm(_off(candidates, X[some], x[some]), axis=-1), axis=-1)
     P = candidates[np.nanargmin(medians)]
     for _ in range(_ROUNDS):
         distance = np.linalg.norm(_off(P, X, x), axis=-1)

@@ -31,3 +31,24 @@ def test_a_gear_is_named_and_stated_by_few_of_the_markers_too(monkeypatch, detec
     ahead = around(robot, 100, rng)
     off = predict(found, ahead) - robot.images(true(ahead))
     assert np.sqrt(np.mean((off**2).sum(axis=-1))) < 2.0 * found.predicted_rms_px
+
+
+@pytest.mark.parametrize(
+    ("types", "views", "lens"), [("RRPR", 2, False), ("RRR", 4, False), ("RRR", 2, True)]
+)
+def test_a_search_with_some_of_the_markers_ends_where_that_with_all_does(monkeypatch, types, views, lens):
+    """With wrong detections and markers that single views see; to a hundredth of the noise."""
+    rng = np.random.default_rng(views)
+    robot = random_robot(types, rng, markers=40, views=views)
+    q = np.concatenate([trials(robot, frames=6), around(robot, 30, rng)])
+    seen = robot.observe(q, SIGMA, rng)
+    images = np.where(rng.random(seen.images.shape[:3])[..., None] < 0.1, np.nan, seen.images)
+    images[rng.random(images.shape[:3]) < 0.01] += 40.0
+    seen = dataclasses.replace(seen, images=images, view=tuple("abcd"[:views]) if views > 2 else seen.view)
+    found = []
+    for detections in (40_000, 1_000):
+        monkeypatch.setattr(robust_fit, "_MAX_JUDGED_DETECTIONS", detections)
+        found.append(calibrate(seen, types, source="recorded", joint_noise=0.0, lens=lens))
+    whole, few = (predict(one, around(robot, 50, np.random.default_rng(0))) for one in found)
+    np.testing.assert_allclose(few, whole, atol=0.01 * SIGMA)
+    np.testing.assert_array_equal(found[0].outlier, found[1].outlier)
