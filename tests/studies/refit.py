@@ -1,6 +1,7 @@
 """A camera that moved, fitted again: its error over that of a whole recalibration, and its 95 % regions.
 
     python -m tests.studies.refit [--calibrations 100] [-o refit.csv]
+    python -m tests.studies.refit --wrong [--calibrations 100] [-o refit.csv]
 
 Each calibration of the UR5 of the reference data is at 0.5 px, from single-joint trials and twelve combined
 poses to ±30°, and has five draws. In each the left camera is turned by 3° and shifted by 30 mm, in random
@@ -8,9 +9,14 @@ directions, and fitted again from 5, 10 and 20 random poses within ±45° and ±
 calibrated again from all poses. Errors and regions are of left images at held-out poses within ±30°; the
 region of a pose is that of the images of all markers in both cameras. Images of the right camera confirm the
 joint readings; how often those of the left one alone do is counted.
+
+``--wrong`` asks for the left camera where no camera moved: in one draw of each calibration a random joint slipped
+by 0.5 to 2 degrees, in another nothing happened. Both cameras show ten poses within ±45°. Counted are the
+findings by which that is refused.
 """
 
 import dataclasses
+from collections import Counter
 
 import numpy as np
 from scipy.linalg import expm
@@ -34,6 +40,8 @@ RANGES_DEG, POSES = (45, 8), (5, 10, 20)
 TURN_RAD, SHIFT_M = np.radians(3.0), 0.03
 EACH = 5  # draws of a calibration
 COLUMNS = ("calibration", "draw", "range", "poses", "refused", "square", "of_markers", "of_poses")
+SLIPS_DEG = (0.5, 2.0)
+REFUSED = ("calibration", "case", "joint", "by_deg", "code", "reason")
 LIMIT = {(45, 10): 2.0, (45, 20): 1.5}  # of the error over that of a whole recalibration
 CHI2 = chi2.ppf(0.95, np.arange(100))  # by degrees of freedom
 RANK = 1e-9  # of the largest eigenvalue, below which a direction of a region is empty
@@ -101,6 +109,31 @@ def drawn(number):
     return rows
 
 
+def asked_in_vain(number):
+    """Rows of one calibration, fitted again where a joint slipped, and where nothing happened."""
+    rng, robot = np.random.default_rng([SEED, number, 1]), robot_of(RIGS["ur5 combined"], 2)
+    q = np.concatenate([trials(robot, frames=FRAMES), around(robot, COMBINED, rng)])
+    before = calibrate(
+        robot.observe(q, NOISE_PX, rng), robot.joint_types, source="simulated", sigma_px=NOISE_PX
+    )
+    for case in ("slipped", "unmoved"):
+        joint, by = int(rng.integers(len(robot.joint_types))), rng.choice([-1, 1]) * rng.uniform(*SLIPS_DEG)
+        read = around(robot, 10, rng, np.radians(45), 0.15)
+        true = read + (case == "slipped") * np.radians(by) * np.eye(read.shape[1])[joint]
+        seen = dataclasses.replace(robot.observe(true, NOISE_PX, rng), q=read)
+        row = {"calibration": number, "case": case, "joint": joint + 1, "by_deg": by}
+        try:
+            refit(before, seen, "left")
+            yield row | {"code": "accepted"}
+        except WorkFailed as error:
+            yield row | {"code": error.findings[0].code, "reason": str(error)}
+
+
+def rows_in_vain(number):
+    """The same as a list, for another process."""
+    return list(asked_in_vain(number))
+
+
 def row_of(*values):
     """What a row of the table is of."""
     return dict(zip(COLUMNS, values, strict=False))
@@ -108,7 +141,16 @@ def row_of(*values):
 
 def main():
     """Judge all draws, print a line a design, and write the table."""
-    asked = parser_of("refit", __doc__, [("calibrations", 100, f"with {EACH} draws each")]).parse_args()
+    parser = parser_of("refit", __doc__, [("calibrations", 100, f"with {EACH} draws each")])
+    parser.add_argument("--wrong", action="store_true", help="ask where no camera moved")
+    asked = parser.parse_args()
+    if asked.wrong:
+        rows = written(
+            asked.output, REFUSED, in_two_processes(rows_in_vain, range(asked.calibrations), "refit")
+        )
+        for (case, code), count in sorted(Counter((row["case"], row["code"]) for row in rows).items()):
+            print(f"{case}: {code} {count}")
+        return
     rows = written(asked.output, COLUMNS, in_two_processes(drawn, range(asked.calibrations), "refit"))
     whole = np.sqrt(np.mean([row["square"] for row in rows if row["range"] == 30]))
     print(f"whole recalibration: {whole:.3f} px rms of a left coordinate, {asked.calibrations} draws")
