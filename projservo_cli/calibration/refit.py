@@ -256,13 +256,19 @@ def refit(
 
 
 def _require_moved(images: _Images, view: str) -> None:
-    """Refuse to fit a camera again whose images agree with the calibration; a WorkFailed."""
+    """Refuse to fit a camera again whose images agree with the calibration, or show a joint; a WorkFailed."""
     c = images.calibration
-    views = images.errors_of_views(parameters_from(c), errors_of(c))
+    params, errors = parameters_from(c), errors_of(c)
+    views = images.errors_of_views(params, errors)
     of_view = views[c.view.index(view)]
-    if np.isfinite(of_view.off_px) and not of_view.disagrees:
-        seen = tuple(one.finding for one in views if np.isfinite(one.off_px))
-        raise failed([Finding("unmoved_camera", REFUSES, Subject(views=(view,)), others=seen)])
+    if not np.isfinite(of_view.off_px) or of_view.disagrees:
+        return
+    problem, seen = images.problem, images.problem.detections.seen
+    near = np.linalg.norm(problem.residual(params), axis=2) <= OUTLIER * images.deviation(params, errors)
+    nothing = np.zeros((*images.problem.detections.pixels.shape, 0))
+    _JointOffsets.of(images, params, errors, seen & near, nothing).require_none(images, view)
+    told = tuple(one.finding for one in views if np.isfinite(one.off_px))
+    raise failed([Finding("unmoved_camera", REFUSES, Subject(views=(view,)), others=told)])
 
 
 def since_moved(old: Observation, new: Observation, view: str) -> Observation:
@@ -359,11 +365,79 @@ def errors_of_others(c: Calibration, v: int, errors: Errors | None = None) -> Er
     return errors._replace(shared=shared)
 
 
+class _JointOffsets(NamedTuple):
+    """Offsets of single joints by images of all views, across what a camera can do."""
+
+    offset: FloatArray  # (n,) in rad × ``per_rad``
+    square: FloatArray  # (n,) information on each; infinite where the camera moves images alike
+    effect: FloatArray  # (n,) rms motion of the images by each, over their noise
+    left: float  # sum of squares that the camera leaves
+    coordinates: float  # number of those seen
+    numbers: int  # of the camera
+
+    @classmethod
+    def of(
+        cls, images: _Images, params: Parameters, errors: Errors, mask: BoolArray, beside: FloatArray
+    ) -> "_JointOffsets":
+        """Test each joint by residuals of covariance I + T Tᵀ and noise of joints.
+
+        mask : (V, N) detections that count; beside : (V, N, 2, k) changes by what a camera can do.
+        """
+        problem, found = images.problem, images.problem.detections
+        mask = mask & np.isin(found.marker_of, even_choice(found.marker.size, MAX_JUDGED))
+        common, own = images.changes(params, errors)
+        T = apart(
+            common, own, np.broadcast_to(found.marker_of[:, None], (*found.seen.shape, 2)), found.marker.size
+        )
+        per = per_rad(params.prismatic)
+        columns = (
+            *(beside, problem.joint_derivative(params) * per),
+            *(problem.residual(params)[..., None], T),
+        )
+        stacked = np.concatenate(columns, axis=-1) * mask[..., None, None]
+        stacked = problem.whitened(params, stacked.reshape(-1, stacked.shape[-1]), mask)
+        n, k = len(per), beside.shape[-1]
+        Y, T = np.hsplit(stacked, [k + n + 1])
+        crossed = T.T @ Y
+        gram = Y.T @ Y - crossed.T @ np.linalg.solve(np.eye(T.shape[1]) + T.T @ T, crossed)
+        left = gram[k:, k:] - gram[k:, :k] @ np.linalg.solve(gram[:k, :k], gram[:k, k:])
+        own_square = np.diagonal(left)[:n]
+        square = np.where(own_square > _ALIKE * np.diagonal(gram)[k : k + n], own_square, np.inf)
+        offset, count = -left[:n, n] / square, 2.0 * float(mask.sum())
+        effect = np.abs(offset) * np.sqrt(np.diagonal(Y.T @ Y)[k : k + n] / count)
+        return cls(offset, square, effect, float(left[n, n]), count, k)
+
+    @property
+    def ratio(self) -> float:
+        """Noise over that expected, with the camera alone."""
+        return float(np.sqrt(self.left / (self.coordinates - self.numbers)))
+
+    def require_none(self, images: _Images, name: str) -> None:
+        """Refuse the offset of a joint that images show, if it matters to them. Raises WorkFailed."""
+        gain = self.offset**2 * np.where(np.isfinite(self.square), self.square, 0.0)
+        i = int(np.argmax(gain))
+        freedom = self.coordinates - self.numbers - 1
+        std = float(np.sqrt(max((self.left - gain[i]) / freedom, 1.0) / self.square[i]))
+        if abs(self.offset[i]) > _SURE * std and self.effect[i] > _MATTERS:
+            times = (Finding("effect", amount=float(self.effect[i]), limit=_MATTERS, unit="1"),)
+            raise _of_joint(images, name, "refit_slip", i, self.offset[i], deviation=std, others=times)
+
+
+def _of_joint(images: _Images, view: str, code: str, i: int, amount: float, **more: Any) -> WorkFailed:
+    """Return the refusal by a finding on a joint, its numbers in rad × ``per_rad``."""
+    found = images.problem.detections
+    per = float(per_rad(found.prismatic)[i])
+    scaled = {name: per * x for name, x in more.items() if name in ("deviation", "limit")}
+    subject = Subject(joints=(int(found.numbers[i]),), views=(view,))
+    one = Finding(code, REFUSES, subject, per * float(amount), unit=found.units[i], **(more | scaled))
+    return failed([one])
+
+
 def _require_confirmed(camera: _Camera) -> float:
     """Refuse joint readings that images contradict, or that nothing confirms; the noise over that expected.
 
-    All views together have residuals r of covariance S = I + T Tᵀ and noise of joints. Across what the camera
-    can do, an offset of each joint is tested for what it is, and for what would pass unnoticed.
+    Across what the camera can do, an offset of each joint is tested for what it is, and for what would pass
+    unnoticed.
     """
     images, v, params = camera.images, camera.v, camera.params
     problem, found, c = images.problem, images.problem.detections, images.calibration
@@ -373,51 +447,17 @@ def _require_confirmed(camera: _Camera) -> float:
             raise failed([Finding("other_view_off", REFUSES, others=(one.finding,))])
     near = np.linalg.norm(problem.residual(params), axis=2) <= OUTLIER * images.deviation(params, errors)
     mask = camera.used | (found.seen & near & (np.arange(len(found.seen)) != v)[:, None])
-    mask &= np.isin(found.marker_of, even_choice(found.marker.size, MAX_JUDGED))
-    common, own = images.changes(params, errors)
-    T = apart(
-        common, own, np.broadcast_to(found.marker_of[:, None], (*found.seen.shape, 2)), found.marker.size
-    )
-    per = per_rad(params.prismatic)
-    columns = (
-        *(images.by_camera(params, v) @ camera.root, problem.joint_derivative(params) * per),
-        *(problem.residual(params)[..., None], T),
-    )
-    stacked = np.concatenate(columns, axis=-1) * mask[..., None, None]
-    stacked = problem.whitened(params, stacked.reshape(-1, stacked.shape[-1]), mask)
-    n, k = len(per), camera.root.shape[1]
-    Y, T = np.hsplit(stacked, [k + n + 1])
-    crossed = T.T @ Y
-    gram = Y.T @ Y - crossed.T @ np.linalg.solve(np.eye(T.shape[1]) + T.T @ T, crossed)
-    left = gram[k:, k:] - gram[k:, :k] @ np.linalg.solve(gram[:k, :k], gram[:k, k:])
-    count = 2.0 * mask.sum()
-    own_square = np.diagonal(left)[:n]
-    square = np.where(own_square > _ALIKE * np.diagonal(gram)[k : k + n], own_square, np.inf)
-    offset, gain = -left[:n, n] / square, left[:n, n] ** 2 / square
-    effect = np.abs(offset) * np.sqrt(np.diagonal(Y.T @ Y)[k : k + n] / count)
-
-    def of_joint(code: str, i: int, amount: float, **more: Any) -> WorkFailed:
-        subject = Subject(joints=(found.numbers[i],), views=(name,))
-        unit = "m" if params.prismatic[i] else "rad"
-        return failed([Finding(code, REFUSES, subject, float(per[i] * amount), unit=unit, **more)])
-
-    i = int(np.argmax(gain))
-    std = float(np.sqrt(max((left[n, n] - gain[i]) / (count - k - 1), 1.0) / square[i]))
-    if abs(offset[i]) > _SURE * std and effect[i] > _MATTERS:
-        times = (Finding("effect", amount=float(effect[i]), limit=_MATTERS, unit="1"),)
-        raise of_joint("refit_slip", i, offset[i], deviation=float(per[i] * std), others=times)
-    ratio = float(np.sqrt(left[n, n] / (count - k)))
+    of_camera = images.by_camera(params, v) @ camera.root
+    offsets = _JointOffsets.of(images, params, errors, mask, of_camera)
+    offsets.require_none(images, name)
+    ratio, freedom = offsets.ratio, offsets.coordinates - offsets.numbers
     if ratio > REFUSE_RATIO:
         raise failed([Finding("refit_misfit", REFUSES, amount=ratio, limit=REFUSE_RATIO, unit="1")])
-    unnoticed, limit = (
-        _SURE * max(ratio, 1.0) / np.sqrt(square),
-        max(_UNNOTICED_RAD, 2.0 * (c.sigma_q or 0.0)),
-    )
-    i = int(np.argmax(unnoticed))
+    unnoticed = _SURE * max(ratio, 1.0) / np.sqrt(offsets.square)
+    limit, i = max(_UNNOTICED_RAD, 2.0 * (c.sigma_q or 0.0)), int(np.argmax(unnoticed))
     if unnoticed[i] > limit:
-        raise of_joint("refit_unnoticed", i, unnoticed[i], limit=float(per[i] * limit))
-    significant = ratio**2 > chdtri(count - k, _CHANCE) / (count - k)
-    return ratio if significant else 1.0
+        raise _of_joint(images, name, "refit_unnoticed", i, unnoticed[i], limit=limit)
+    return ratio if ratio**2 > chdtri(freedom, _CHANCE) / freedom else 1.0
 
 
 def _record(

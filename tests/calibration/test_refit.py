@@ -107,6 +107,19 @@ def test_a_wrong_joint_does_not_pass_into_the_camera(case, part):
     assert all(slipped)
 
 
+def test_a_joint_that_slipped_a_little_is_named_and_no_camera_is_said_to_have_moved(case):
+    """By a degree of the last joints, which moves images by less than a view must be off to have moved."""
+    arm, _, before, rng = case
+    n = len(arm.twists)
+    for i in (n - 2, n - 1):
+        seen = arm.observe(around(arm, 16, rng, 0.7, 0.2), SIGMA, rng)
+        wrong = dataclasses.replace(seen, q=seen.q + np.radians(1.0) * np.eye(n)[i])
+        with pytest.raises(WorkFailed) as refused:
+            refit(before, wrong, "left")
+        (one,) = refused.value.findings
+        assert one.code == "other_view_off" or one.subject.joints == (i + 1,)
+
+
 def test_few_poses_of_one_camera_confirm_no_readings_and_another_camera_does(case):
     arm, moved, before, rng = case
     seen = moved.observe(around(arm, 3, rng, 0.03, 0.01), SIGMA, rng)

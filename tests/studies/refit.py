@@ -10,9 +10,9 @@ calibrated again from all poses. Errors and regions are of left images at held-o
 region of a pose is that of the images of all markers in both cameras. Images of the right camera confirm the
 joint readings; how often those of the left one alone do is counted.
 
-``--wrong`` asks for the left camera where no camera moved: in one draw of each calibration a random joint slipped
-by 0.5 to 2 degrees, in another nothing happened. Both cameras show ten poses within ±45°. Counted are the
-findings by which that is refused.
+``--wrong`` asks for the left camera where no camera moved: in one draw of each calibration a random joint
+slipped by 0.5 to 2 degrees, in another nothing happened. Both cameras show ten poses within ±45°. Counted are
+the findings by which that is refused.
 """
 
 import dataclasses
