@@ -16,9 +16,10 @@ EXPLAINED = 3.0
 # Minimum share of the detections of an image that are rejected where its camera moved, or it shows another
 # pose, and minimum number of them: two more than its motion has coordinates, to test it.
 MOSTLY, SEEN_OF_IMAGE = 0.5, 4
-# Median residual by another order of joints over that by the order as given, below which it explains poses;
-# maximum number of joints of which all orders are tried, and of markers by which.
-_EXPLAINS, _MOST_JOINTS, _ORDERED = 0.2, 6, 8
+# Median residual by another order of joints over that by the order as given, below which it explains poses,
+# and over noise, within which it need only be half; maximum number of joints of which all orders are tried,
+# and of markers by which.
+_EXPLAINS, _OF_NOISE, _MOST_JOINTS, _ORDERED = 0.2, 1.5, 6, 8
 
 
 def shown_poses(solution: Solution, out: BoolArray) -> IntArray:
@@ -85,4 +86,7 @@ def other_order(solution: Solution, poses: IntArray) -> bool:
         orders = list(permutations(given))[1:]
     else:
         orders = [(*given[:i], i + 1, i, *given[i + 2 :]) for i in range(n - 1)]
-    return min(map(level, orders)) <= _EXPLAINS * level(given) if len(poses) and orders else False
+    if not (len(poses) and orders):
+        return False
+    best, noise_px = min(map(level, orders)), _OF_NOISE * RAYLEIGH * solution.sigma_px
+    return best <= min(max(_EXPLAINS * level(given), noise_px), 0.5 * level(given))

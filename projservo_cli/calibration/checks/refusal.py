@@ -41,7 +41,7 @@ _KEPT = 0.5
 # Minimum number of poses in a row that are nearly all rejected where something changed.
 _WRONG_RUN = 5
 # Joints that are farther than this share of their range from the median have moved; so many poses in which
-# several did, and this share of them, are rejected at least where readings are in the wrong order.
+# several did are rejected at least where readings are in the wrong order, and this share where no order is.
 _MOVED, _WRONG_POSES, _WRONG_SHARE = 0.1, 3, 0.5
 # Maximum share of the other poses that is rejected there, over that of these.
 _OTHERS_SHARE = 0.25
@@ -194,10 +194,11 @@ def _wrong_order(solution: Solution, rejected: BoolArray) -> Finding | None:
     several = away.sum(axis=1) > 1
     wrong, alone = np.count_nonzero(several & lost), np.count_nonzero(~several & lost)
     count, others = several.sum(), np.count_nonzero(~several)
-    few = wrong < max(_WRONG_POSES, _WRONG_SHARE * count)
-    if few or alone * count > _OTHERS_SHARE * wrong * others:
+    if wrong < _WRONG_POSES or alone * count > _OTHERS_SHARE * wrong * others:
         return None
     code = "joint_order" if other_order(solution, np.flatnonzero(several & lost)) else "several_joints"
+    if code == "several_joints" and wrong < _WRONG_SHARE * count:
+        return None
     rest = Finding(code, REFUSES, amount=int(alone), limit=int(others), unit="1")
     return Finding(code, REFUSES, amount=int(wrong), limit=int(count), unit="1", others=(rest,))
 

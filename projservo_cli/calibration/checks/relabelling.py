@@ -17,14 +17,16 @@ from projservo_cli.calibration.bundle_adjustment import LeastSquares, minimize
 from projservo_cli.calibration.checks.numbering import size_changes
 from projservo_cli.calibration.checks.outliers import Outliers
 from projservo_cli.calibration.checks.refusal import unexplained
-from projservo_cli.calibration.detections import Detections
+from projservo_cli.calibration.detections import Detections, even_choice
 from projservo_cli.calibration.initialization import Search, starting_markers, starts
-from projservo_cli.calibration.robust_fit import fit_from
+from projservo_cli.calibration.robust_fit import Solution, fit_from
 from projservo_cli.findings import REFUSES, Finding, Subject
 from projservo_cli.records import TOOL, WORLD, FloatArray, WorkFailed, letters_of
 
 # Number of relabellings of a kind that are fitted completely, and minimum share of detections that fit them.
 _FOLLOWED, _KEPT = 2, 0.8
+# Images that come one pose late, or early, from a pose on; number of poses that are tried if none is known.
+_SHIFTED, _ONSETS = ("images_late_from", "images_early_from"), 8
 # Number of adjustment steps of the screws by which they are compared before.
 _SCREW_STEPS = 8
 # Log residual added to a joint of the other type, which explains more: one that stands still is simpler.
@@ -61,6 +63,25 @@ class _Data(NamedTuple):
         q_0 = changed.pop("q_0", self.q_reference)
         finding = Finding(code, REFUSES, subject, amount, unit=unit)
         return Relabelling(finding, dataclasses.replace(self.detections, **changed), q_0)
+
+    def shifted(self, code: str, at: int) -> Relabelling:
+        """Return the relabelling by which images come one pose late, or early, from a row of a pose on."""
+        q, subject = self.detections.q, Subject(poses=(int(self.detections.pose[at]),))
+        later = q[at - 1 : -1] if code == _SHIFTED[0] else np.vstack([q[at + 1 :], q[-1:]])
+        return self.with_(code, subject, "1", len(later), q=np.vstack([q[:at], later]))
+
+    def dated(self, one: Relabelling, found: Solution) -> Relabelling:
+        """Return images that are late, or early, from the pose on from which a fit says so."""
+        d, K, problem = self.detections, len(self.detections.q), found.problem
+        levels = []
+        for q in (d.q, self.shifted(one.finding.code, 1).detections.q):
+            there = dataclasses.replace(problem, q=q - problem.q_reference)
+            off = np.linalg.norm(there.residual(dataclasses.replace(found.params, offsets=None)), axis=2)
+            square = np.log(np.square(off / found.sigma_px).sum(axis=0) + 1.0)
+            levels.append(np.bincount(d.pose_of, square, K))
+        left = np.cumsum(levels[0]) + np.cumsum(levels[1][::-1])[::-1]  # of the poses around each onset
+        at = 1 + int(np.argmin(left[:-1] - levels[1][:-1]))
+        return self.shifted(one.finding.code, min(at, K - 2))
 
     def of_joint(self, *joints: int, name: str = "") -> Subject:
         """Return joints, by their columns, as the subject of a finding."""
@@ -168,16 +189,11 @@ def _units(data: _Data) -> Iterator[Relabelling]:
 
 def _late_from(data: _Data) -> Iterator[Relabelling]:
     """Images that come one pose late or early against their readings, from a pose on."""
-    d, at = data.detections, data.onset
-    if at is None or not 0 < at < len(d.q) - 1:
-        return
-    subject = Subject(poses=(int(d.pose[at]),))
-    shifted = {
-        "images_late_from": d.q[at - 1 : -1],
-        "images_early_from": np.vstack([d.q[at + 1 :], d.q[-1:]]),
-    }
-    for code, q in shifted.items():
-        yield data.with_(code, subject, "1", len(q), q=np.vstack([d.q[:at], q]))
+    K = len(data.detections.q)
+    tried = even_choice(K, _ONSETS + 2)[1:-1].tolist() if data.onset is None else [data.onset]
+    for at in tried if K > 2 else ():
+        if 0 < at < K - 1:
+            yield from (data.shifted(code, at) for code in _SHIFTED)
 
 
 def _sizes(data: _Data) -> Iterator[Relabelling]:
@@ -209,15 +225,15 @@ def relabelled(
     data = _Data(few, search.problem.q_reference, onset)
     if straight is not None:
         types = list(_types(data))
-        return _best(search, max_px, [types[i] for i in straight])
+        return _best(data, search, max_px, [types[i] for i in straight])
     for kinds in (SIMPLE, OTHERS):
-        found = _best(search, max_px, [one for kind in kinds for one in kind(data)])
+        found = _best(data, search, max_px, [one for kind in kinds for one in kind(data)])
         if found is not None:
             return found
     return None
 
 
-def _best(search: Search, max_px: float, tried: Sequence[Relabelling]) -> Relabelling | None:
+def _best(data: _Data, search: Search, max_px: float, tried: Sequence[Relabelling]) -> Relabelling | None:
     """Return the best of some relabellings by which the model fits, and the noise that it leaves, or None."""
     candidates = []
     try:
@@ -237,6 +253,9 @@ def _best(search: Search, max_px: float, tried: Sequence[Relabelling]) -> Relabe
     candidates.sort(key=lambda candidate: candidate[0])
     for _, one, problem, params in candidates[:_FOLLOWED]:
         found = fit_from(problem, params, search.epipolar)
+        if found is not None and one.finding.code in _SHIFTED:
+            one = data.dated(one, found)
+            found = fit_from(one.problem, found.params, search.epipolar)
         if found is None or found.sigma_px > max_px or found.used.sum() < _KEPT * one.detections.seen.sum():
             continue
         if unexplained(found, Outliers.empty(one.detections), search.epipolar) is None:
