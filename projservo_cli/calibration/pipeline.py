@@ -362,7 +362,7 @@ def _refined(
                 )
     except Misfit as refused:
         hint = deviation(solution, expected) if share < _DECISIVE_SHARE else of_lens
-        by_joints = refused.findings[0].code == "several_joints"  # then nothing else moved
+        by_joints = refused.findings[0].code in ("several_joints", "erring_joint")  # nothing else moved
         if hint is None or (by_joints and not hint.subject.joints):
             raise
         raise Misfit.by([*refused.findings, hint], detections) from None

@@ -336,6 +336,13 @@ REFUSALS = {
         "record poses in which all joints move (calibration.random_poses), which tell periodic errors",
         limit="errors of joints",
     ),
+    "erring_joint": Row(
+        "{joints} is off its readings by {amount} rms at {rest} of the {of_rest} poses in which several "
+        "joints move, and not in trials of single joints",
+        "look at its gear and its encoder, and record poses in which all joints move "
+        "(calibration.random_poses), which tell errors that repeat",
+        limit="errors of {joints}",
+    ),
     "joint_order": Row(
         "the fit rejects {count} of the {total} poses in which several joints move, and {rest} of the "
         "{of_rest} others",

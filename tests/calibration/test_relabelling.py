@@ -202,15 +202,22 @@ def test_a_camera_that_moved_far_and_came_back_is_named_by_its_poses():
     assert found.usable
 
 
-def test_joints_that_err_by_more_than_trials_show_are_not_in_another_order():
+@pytest.mark.parametrize("erring", [(2,), (1, 2)])
+def test_joints_that_err_by_more_than_trials_show_are_not_in_another_order(erring):
+    """By a wave that is nothing where a joint moves alone; one joint that does is named."""
     robot, q, rng = recorded(12, count=12)
-    away = q[:, 2] - robot.q_reference[2]
-    alone = np.unique(np.round(away[np.abs(q - robot.q_reference)[:, :2].max(axis=1) < 1e-9], 9))
-    wave = np.sin(np.pi * np.interp(away, alone, np.arange(alone.size)))  # nothing where it moves alone
-    seen = dataclasses.replace(
-        robot.observe(q + np.radians(5.0) * wave[:, None] * np.eye(3)[2], SIGMA, rng), q=q
-    )
-    assert refused(seen).code == "several_joints"
+    q = rng.permutation(q)
+    away, true = q - robot.q_reference, q.copy()
+    for i in erring:
+        alone = np.unique(np.round(away[np.abs(np.delete(away, i, axis=1)).max(axis=1) < 1e-9, i], 9))
+        wave = np.sin(np.pi * np.interp(away[:, i], alone, np.arange(alone.size)))
+        true[:, i] += np.radians(5.0) * wave
+    one = refused(dataclasses.replace(robot.observe(true, SIGMA, rng), q=q))
+    if len(erring) > 1:
+        assert one.code == "several_joints"
+        return
+    assert (one.code, one.subject.joints) == ("erring_joint", (3,))
+    assert 0.3 * np.radians(5.0) < one.amount < np.radians(5.0)
 
 
 def test_a_pose_at_which_all_cameras_are_off_alike_is_of_the_arm():

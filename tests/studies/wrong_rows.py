@@ -139,7 +139,7 @@ def cyclic(arm, q, ahead, rng):
         w.turn(i, size * np.sin(2.0 * np.pi * w.read(i) / period + phase))
 
     there = images(arm, ahead, put, held=True)
-    return Table(q, images(arm, q, put), ahead, there, ("cyclic", "joint_noise"), joints=(i,))
+    return Table(q, images(arm, q, put), ahead, there, ("cyclic", "joint_noise", "erring_joint"), joints=(i,))
 
 
 def servo_curve(arm, q, ahead, rng):

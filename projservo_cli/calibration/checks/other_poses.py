@@ -8,7 +8,7 @@ import numpy as np
 
 from projservo_cli.calibration.detections import RAYLEIGH, Detections
 from projservo_cli.calibration.robust_fit import Solution
-from projservo_cli.findings import LIMITS, Finding, Subject
+from projservo_cli.findings import LIMITS, REFUSES, Finding, Subject
 from projservo_cli.records import BoolArray, IntArray
 
 # Median residual, in σ, below which something explains a pose.
@@ -16,6 +16,8 @@ EXPLAINED = 3.0
 # Minimum share of the detections of an image that are rejected where its camera moved, or it shows another
 # pose, and minimum number of them: two more than its motion has coordinates, to test it.
 MOSTLY, SEEN_OF_IMAGE = 0.5, 4
+# Steps of Gauss and Newton to the reading of a joint, and median residual by the next joint over that by it.
+_STEPS, _CLEARER = 6, 2.0
 # Median residual by another order of joints over that by the order as given, below which it explains poses,
 # and over noise, within which it need only be half; maximum number of joints of which all orders are tried,
 # and of markers by which.
@@ -57,6 +59,30 @@ def on_shown_poses(detections: Detections, shown: IntArray) -> Iterator[Finding]
             poses, others = (tuple(detections.pose[of_view[:, i]].tolist()) for i in (0, 2))
             instead = Finding("shown_poses", subject=Subject(poses=others))
             yield Finding("other_pose", LIMITS, Subject(views=(name,), poses=poses), others=(instead,))
+
+
+def erring_joint(solution: Solution, poses: IntArray) -> Finding | None:
+    """Find the one joint whose readings alone are off at poses, by rows, that a fit rejects."""
+    solution = solution.thinned(_ORDERED)
+    params, detections = dataclasses.replace(solution.params, offsets=None), solution.problem.detections
+    there = solution.problem.with_noise(None).rows(np.flatnonzero(np.isin(detections.pose_of, poses)))
+    seen, tried = there.detections.seen, list[tuple[float, int, float]]()
+    for i in range(len(params.H_hat)):
+        off = np.zeros(len(there.q))
+        for _ in range(_STEPS):
+            here = dataclasses.replace(there, q=there.q + off[:, None] * np.eye(there.q.shape[1])[i])
+            r, G = here.residual(params), here.joint_derivative(params)[..., i]
+            square = here.at_poses((G**2).sum(axis=(0, 2)))
+            off -= here.at_poses((G * r).sum(axis=(0, 2))) / np.maximum(square, 1e-300)
+        level = float(np.median(np.linalg.norm(r, axis=2)[seen]))
+        tried.append((np.nan_to_num(level, nan=np.inf), i, float(np.sqrt(np.mean(off[poses] ** 2)))))
+    tried.sort()
+    explained = EXPLAINED * RAYLEIGH * solution.sigma_px
+    if tried[0][0] > explained or (len(tried) > 1 and tried[1][0] < _CLEARER * tried[0][0]):
+        return None
+    _, i, amount = tried[0]
+    subject = Subject(joints=(int(detections.numbers[i]),))
+    return Finding("erring_joint", REFUSES, subject, amount, unit=detections.units[i])
 
 
 def other_order(solution: Solution, poses: IntArray) -> bool:

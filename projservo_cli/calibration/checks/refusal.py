@@ -1,12 +1,13 @@
 """Refusals of a fit, and the causes that its residuals show: joints, poses that changed."""
 
+import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
 
 from projservo_cli.calibration.bundle_adjustment import LeastSquares
 from projservo_cli.calibration.checks.model_error import stepped
-from projservo_cli.calibration.checks.other_poses import other_order
+from projservo_cli.calibration.checks.other_poses import erring_joint, other_order
 from projservo_cli.calibration.checks.outliers import MAX_OF_POSE, Outliers, fits_other_joints
 from projservo_cli.calibration.checks.quality import check_model
 from projservo_cli.calibration.checks.validation import cross_validate
@@ -186,7 +187,8 @@ def _wrong_order(solution: Solution, rejected: BoolArray) -> Finding | None:
     """Find poses of several joints that are rejected where those of one are not, or None.
 
     One joint at a time moves alike whichever column its readings are in: only together they show the order.
-    Where no other order explains these poses, joints err by more than the readings of trials show.
+    Where no other order explains these poses, joints err by more than the readings of trials show: one, or
+    several.
     rejected : (V, K) views of poses that mostly are.
     """
     detections, lost = solution.problem.detections, rejected.all(axis=0)
@@ -196,7 +198,13 @@ def _wrong_order(solution: Solution, rejected: BoolArray) -> Finding | None:
     count, others = several.sum(), np.count_nonzero(~several)
     if wrong < _WRONG_POSES or alone * count > _OTHERS_SHARE * wrong * others:
         return None
-    code = "joint_order" if other_order(solution, np.flatnonzero(several & lost)) else "several_joints"
+    poses, share = (
+        np.flatnonzero(several & lost),
+        Finding("several_joints", amount=int(wrong), limit=int(count), unit="1"),
+    )
+    code = "joint_order" if other_order(solution, poses) else "several_joints"
+    if code == "several_joints" and (one := erring_joint(solution, poses)):
+        return dataclasses.replace(one, others=(share,))
     if code == "several_joints" and wrong < _WRONG_SHARE * count:
         return None
     rest = Finding(code, REFUSES, amount=int(alone), limit=int(others), unit="1")
