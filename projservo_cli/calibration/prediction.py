@@ -52,8 +52,14 @@ def moved_points(E: FloatArray, M: FloatArray) -> FloatArray:
 
 
 def image_points(P: FloatArray, points: FloatArray) -> FloatArray:
-    """Homogeneous image points (…, 2, m, 3) of points (…, m, 4) in all cameras (V, 3, 4), [RH00] eq. (1)."""
-    return np.asarray(points[..., None, :, :] @ np.swapaxes(P, 1, 2))
+    """Homogeneous image points (…, V, m, 3) of points (…, m, 4) in cameras (…, V, 3, 4), [RH00] eq. (1)."""
+    return np.asarray(points[..., None, :, :] @ np.swapaxes(P, -1, -2))
+
+
+def pixels_of(P: FloatArray, lens: FloatArray, points: FloatArray) -> FloatArray:
+    """Raw pixels (…, V, m, 2) of points (…, m, 4) in cameras (…, V, 3, 4) with lenses (…, V, 5)."""
+    m = image_points(P, points)
+    return distort(lens[..., None, :], m[..., :2] / m[..., 2:])
 
 
 def projection_derivative(

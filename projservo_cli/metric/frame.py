@@ -23,6 +23,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from projservo_cli.calibration.prediction import pixels_of, projection_derivative
 from projservo_cli.geometry.displacements import (
     carried_screws,
     homogeneous,
@@ -32,7 +33,7 @@ from projservo_cli.geometry.displacements import (
     twists,
 )
 from projservo_cli.geometry.joint_curve import true_joints
-from projservo_cli.geometry.lens import TERMS, distort, undistort
+from projservo_cli.geometry.lens import TERMS, undistort
 from projservo_cli.geometry.stereo import triangulate_points
 from projservo_cli.records import (
     MM,
@@ -49,8 +50,6 @@ from projservo_cli.records import (
 
 # Step of the differences that propagate covariances, in standard deviations of the calibration.
 _STEP = 0.05
-# Step of the differences of pixels by points, over the distance of the camera.
-_PROBE = 1e-4
 # Number of steps of Gauss and Newton after a start by two views, which third ones change by their noise.
 _REFINEMENTS = 4
 # Sine of an angle between axes, or of markers off a line, below which a frame does not rest on it: 3°.
@@ -110,8 +109,7 @@ class MetricParameters(NamedTuple):
 
     def pixels(self, points: FloatArray) -> FloatArray:
         """Raw pixels (…, K, V, 2) of points (…, K, 3) of the frame of the cameras, by view."""
-        m = np.einsum("...vrj,...kj->...kvr", self.P, homogeneous(points))
-        return distort(self.lens[..., None, :, :], m[..., :2] / m[..., 2:])
+        return pixels_of(self.P, self.lens, homogeneous(points)).swapaxes(-3, -2)
 
 
 def invariant_upgrade(H_hat: FloatArray, prismatic: BoolArray) -> FloatArray:
@@ -649,10 +647,9 @@ class Metric:
 
     def _by_point(self, X: FloatArray, seen: BoolArray) -> FloatArray:
         """Derivative (K, 2 V, 3) of pixels by points (K, 3); zero where a view (V, K) sees none."""
-        step = _PROBE * np.linalg.norm(self.poses[0, :3, 3] - X, axis=1)[:, None]
-        moves = [self.body.pixels(X + step * e) - self.body.pixels(X - step * e) for e in np.eye(3)]
-        J = np.moveaxis(np.stack(moves).reshape(3, len(X), -1) / (2.0 * step), 0, -1)
-        return np.asarray(np.where(seen.T.repeat(2, axis=1)[..., None], J, 0.0))
+        P = self.body.P
+        by_point = projection_derivative(P, self.body.lens, homogeneous(X))[1] @ P[:, None, :, :3]
+        return np.where(seen[..., None, None], by_point, 0.0).swapaxes(0, 1).reshape(len(X), -1, 3)
 
     def covariance(self, name: str) -> FloatArray:
         """Covariance of an array.

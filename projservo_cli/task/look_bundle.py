@@ -13,10 +13,14 @@ import numpy as np
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from projservo_cli.calibration.prediction import error_factor_with_model, projection_derivative
+from projservo_cli.calibration.prediction import (
+    error_factor_with_model,
+    pixels_of,
+    projection_derivative,
+)
 from projservo_cli.findings import REFUSES, Finding
 from projservo_cli.geometry.displacements import cross_matrix, generators
-from projservo_cli.geometry.lens import distort, undistort
+from projservo_cli.geometry.lens import undistort
 from projservo_cli.metric.frame import ProjectiveParameters, changes_of, invariant_form
 from projservo_cli.records import BoolArray, Calibration, FloatArray, WorkFailed
 from projservo_cli.task.body import make_body
@@ -110,8 +114,7 @@ class LookRig(NamedTuple):
 
     def pixels(self, points: FloatArray) -> FloatArray:
         """Pixels (B, V, N, 2) of points (N, 4) or (B, N, 4) by each of the models."""
-        m = points[..., None, :, :] @ self.P.swapaxes(2, 3)
-        return distort(self.lens[:, :, None], m[..., :2] / m[..., 2:])
+        return pixels_of(self.P, self.lens, points)
 
 
 def _metric_root(L: FloatArray) -> FloatArray | None:
