@@ -22,7 +22,7 @@ _MAX_NAMED = 3
 _CAUSES = (
     *("other_mount", "images_before_readings", "images_after_readings", "joint_type", "standing_joint"),
     *("exchanged_joints", "full_coupling", "level_hand", "joint_unit", "image_size_changed"),
-    *("images_late_from", "images_early_from"),
+    *("images_late_from", "images_early_from", "tracker_memory"),
 )
 # Findings of which one line names all that are alike.
 _TOGETHER = ("placeholders", "hopeless_joint", "joint_together", "joint_in_few_poses", "little_motion")

@@ -213,6 +213,11 @@ CALIBRATION = {
         "pair images and readings by their times from there on, or remove these {count} poses",
         limit="readings of other poses",
     ),
+    "tracker_memory": Row(
+        "by the images each keeps {percent} % of the one before",
+        "switch the filter of the tracker off, or let each pose settle for longer",
+        limit="a tracker that lags",
+    ),
     "images_early_from": Row(
         "from pose {poses} on each image shows the pose after its reading",
         "pair images and readings by their times from there on, or remove these {count} poses",

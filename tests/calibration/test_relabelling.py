@@ -228,3 +228,15 @@ def test_a_pose_at_which_all_cameras_are_off_alike_is_of_the_arm():
     found = calibrate(seen, TYPES, source="recorded")
     assert not [one for one in found.findings if one.code in ("moved_camera", "unsettled_camera")]
     assert not found.moved_images.size
+
+
+def test_a_tracker_that_keeps_much_is_named_with_its_share():
+    """Of what it keeps a fit rejects most poses: images without it fit, by the share within a tenth of it."""
+    robot, q, rng = recorded(14)
+    seen, share = robot.observe(rng.permutation(q), SIGMA, rng), 0.15
+    images = seen.images.copy()
+    for k in range(1, len(images)):
+        images[k] = (1.0 - share) * seen.images[k] + share * images[k - 1]
+    one = refused(dataclasses.replace(seen, images=images))
+    assert one.code == "tracker_memory"
+    assert one.amount == pytest.approx(share, rel=0.1)

@@ -122,7 +122,7 @@ def creeps(arm, q, ahead, rng):
 def remembers(arm, q, ahead, rng):
     """A tracker that keeps a share of the image before."""
     keep = float(rng.uniform(0.02, 0.1))
-    one = plain(arm, q, ahead, rng, ("memory",))
+    one = plain(arm, q, ahead, rng, ("memory", "tracker_memory"))
     for k in range(1, len(q)):
         one.s[k] = (1.0 - keep) * one.s[k] + keep * one.s[k - 1]
     return one

@@ -27,6 +27,8 @@ from projservo_cli.records import TOOL, WORLD, FloatArray, WorkFailed, letters_o
 _FOLLOWED, _KEPT = 2, 0.8
 # Images that come one pose late, or early, from a pose on; number of poses that are tried if none is known.
 _SHIFTED, _ONSETS = ("images_late_from", "images_early_from"), 8
+# Shares of the image before that a tracker keeps, of those tried.
+_SHARES = (0.03, 0.07, 0.15)
 # Number of adjustment steps of the screws by which they are compared before.
 _SCREW_STEPS = 8
 # Log residual added to a joint of the other type, which explains more: one that stands still is simpler.
@@ -82,6 +84,24 @@ class _Data(NamedTuple):
         left = np.cumsum(levels[0]) + np.cumsum(levels[1][::-1])[::-1]  # of the poses around each onset
         at = 1 + int(np.argmin(left[:-1] - levels[1][:-1]))
         return self.shifted(one.finding.code, min(at, K - 2))
+
+    def remembered(self, share: float) -> Relabelling:
+        """Return the images of a tracker without the share that it keeps of the image before."""
+        d, images = self.detections, self.detections.dense()
+        before = images[:, d.pose_of - 1, d.marker_of]
+        known = np.isfinite(before[..., :1]) & (d.pose_of > 0)[:, None]
+        pixels = np.where(known, (d.pixels - share * np.nan_to_num(before)) / (1.0 - share), d.pixels)
+        return self.with_("tracker_memory", Subject(), "1", share, pixels=pixels)
+
+    def sharper(self, one: Relabelling, found: Solution) -> Relabelling:
+        """Return the images of a tracker without the share that a fit says it keeps."""
+        share, used = one.finding.amount, found.used[..., None]
+        predicted = found.problem.with_noise(None).pixels(dataclasses.replace(found.params, offsets=None))[0]
+        # Without one half they change by as much as they differ from those before.
+        apart = (self.remembered(0.5).detections.pixels - self.detections.pixels) * used
+        off = (predicted - one.detections.pixels) * used
+        step = (1.0 - share) ** 2 * float((off * apart).sum() / np.square(apart).sum())
+        return self.remembered(share + step)
 
     def of_joint(self, *joints: int, name: str = "") -> Subject:
         """Return joints, by their columns, as the subject of a finding."""
@@ -196,6 +216,11 @@ def _late_from(data: _Data) -> Iterator[Relabelling]:
             yield from (data.shifted(code, at) for code in _SHIFTED)
 
 
+def _memories(data: _Data) -> Iterator[Relabelling]:
+    """Images of which each keeps a share of the one before."""
+    yield from map(data.remembered, _SHARES)
+
+
 def _sizes(data: _Data) -> Iterator[Relabelling]:
     """Images of another size from the pose on at which their extent changes most."""
     d = data.detections
@@ -204,9 +229,11 @@ def _sizes(data: _Data) -> Iterator[Relabelling]:
         yield data.with_("image_size_changed", subject, "1", factor, pixels=pixels)
 
 
+# What makes a relabelling exact that was tried with one of many numbers, by a fit with it.
+_NEARER = dict.fromkeys(_SHIFTED, (_Data.dated,)) | {"tracker_memory": (_Data.sharper,) * 3}
 # All relabellings by which the same images may fit: the simple ones first, then those by which more would.
 SIMPLE = (_mounts, _orders_of_images, _types, _standing)
-OTHERS = (_exchanged, _couplings, _parallelograms, _units, _sizes, _late_from)
+OTHERS = (_exchanged, _couplings, _parallelograms, _units, _sizes, _late_from, _memories)
 
 
 def relabelled(
@@ -253,9 +280,10 @@ def _best(data: _Data, search: Search, max_px: float, tried: Sequence[Relabellin
     candidates.sort(key=lambda candidate: candidate[0])
     for _, one, problem, params in candidates[:_FOLLOWED]:
         found = fit_from(problem, params, search.epipolar)
-        if found is not None and one.finding.code in _SHIFTED:
-            one = data.dated(one, found)
-            found = fit_from(one.problem, found.params, search.epipolar)
+        for nearer in _NEARER.get(one.finding.code, ()):
+            if found is not None:
+                one = nearer(data, one, found)
+                found = fit_from(one.problem, found.params, search.epipolar)
         if found is None or found.sigma_px > max_px or found.used.sum() < _KEPT * one.detections.seen.sum():
             continue
         if unexplained(found, Outliers.empty(one.detections), search.epipolar) is None:
