@@ -3,8 +3,9 @@
 A nominal robot and rig may serve as a start too; it is tried, and kept only if it leads to a good fit.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -373,25 +374,44 @@ def _robust_solve(
     return np.asarray(x), np.asarray(means[..., -1] - means[..., :-1] @ x)
 
 
+class Body(NamedTuple):
+    """Cameras and placed points by a guess, and the body that these are of, whatever the joints read."""
+
+    P: FloatArray  # (V, 3, 4)
+    placed: BoolArray  # (N,) observations that have a point
+    points: FloatArray  # (P, 3) of these
+    alignment: _Alignment
+
+
+def bodies(search: Search, detections: Detections, factor: float = 1.0) -> Iterator[Body]:
+    """Yield bodies by the guesses of the geometry of images, most promising first, at a factor of the focal.
+
+    Raises WorkFailed if no three markers are seen together.
+    """
+    for P, points in search.epipolar.guesses(detections, search.frame, factor):
+        placed = np.isfinite(points[:, 0])
+        alignment = _grow_body(points[placed], detections.rows(placed), search.rng)
+        if np.isfinite(alignment.body[:, 0]).sum() < _MIN_MARKERS:
+            raise WorkFailed("no three markers are seen together: more must be seen at once")
+        yield Body(P, placed, points[placed], alignment)
+
+
 def starts(
-    search: Search, detections: Detections, factors: tuple[float, ...] = (1.0,)
+    search: Search,
+    detections: Detections,
+    factors: tuple[float, ...] = (1.0,),
+    known: Sequence[Body] | None = None,
 ) -> Iterator[Parameters]:
     """Yield initial parameters, most promising first: factors of the best focal lengths, and axes for each.
 
-    detections : those of the problem, or of some of its poses.
+    detections : those of the problem, or of some of its poses; known : bodies that their images show.
     Raises WorkFailed if no three markers are seen together.
     """
     for factor in factors:
-        for P, points in search.epipolar.guesses(detections, search.frame, factor):
-            placed = np.isfinite(points[:, 0])
-            guess, known = (P, points[placed]), detections.rows(placed)
-            alignment = _grow_body(guess[1], known, search.rng)
-            rigid = np.isfinite(alignment.body[:, 0])
-            if int(rigid.sum()) < _MIN_MARKERS:
-                raise WorkFailed("no three markers are seen together: more must be seen at once")
-            q = search.problem.q
-            for w in _rotation_axes(alignment, q, known.prismatic, search.rng):
-                params = _solve_points(w, guess, known, q, rigid)
+        for body in bodies(search, detections, factor) if known is None else known:
+            some, rigid = detections.rows(body.placed), np.isfinite(body.alignment.body[:, 0])
+            for w in _rotation_axes(body.alignment, search.problem.q, some.prismatic, search.rng):
+                params = _solve_points(w, (body.P, body.points), some, search.problem.q, rigid)
                 if np.isfinite(params.H_hat).all() and np.isfinite(params.M).all():
                     yield params
 

@@ -18,7 +18,7 @@ from projservo_cli.calibration.checks.numbering import size_changes
 from projservo_cli.calibration.checks.outliers import Outliers
 from projservo_cli.calibration.checks.refusal import unexplained
 from projservo_cli.calibration.detections import Detections, even_choice
-from projservo_cli.calibration.initialization import Search, starting_markers, starts
+from projservo_cli.calibration.initialization import Search, bodies, starting_markers, starts
 from projservo_cli.calibration.robust_fit import Solution, fit_from
 from projservo_cli.findings import REFUSES, Finding, Subject
 from projservo_cli.records import TOOL, WORLD, FloatArray, WorkFailed, letters_of
@@ -264,10 +264,13 @@ def _best(data: _Data, search: Search, max_px: float, tried: Sequence[Relabellin
     """Return the best of some relabellings by which the model fits, and the noise that it leaves, or None."""
     candidates = []
     try:
+        known = [*islice(bodies(search, data.detections), 1)]
         for done, one in enumerate(tried):
             search.progress("calibration, other readings", done, len(tried))
             problem, seen = one.problem, one.detections.seen
-            for start in islice(starts(dataclasses.replace(search, problem=problem), one.detections), 1):
+            same = known if one.detections.pixels is data.detections.pixels else None
+            there = dataclasses.replace(search, problem=problem)
+            for start in islice(starts(there, one.detections, known=same), 1):
                 params = minimize(
                     problem, start, seen, robust=True, cameras=False, max_steps=_SCREW_STEPS
                 ).params
