@@ -764,7 +764,7 @@ def rigid_motions(H_hat: FloatArray, directions: FloatArray, a_inf: FloatArray) 
     """Basis (d, 4, 4) of rigid motions: translations, and those that the joints generate together."""
     brackets = [A @ B - B @ A for A in H_hat for B in H_hat]
     motions = np.concatenate([H_hat, np.array(brackets), directions[:, :, None] * a_inf])
-    sizes, rows = np.linalg.svd(motions.reshape(-1, 16))[1:]
+    sizes, rows = np.linalg.svd(motions.reshape(-1, 16), full_matrices=False)[1:]
     return np.asarray(rows[:6][sizes[:6] > _RANK * sizes[0]].reshape(-1, 4, 4))
 
 

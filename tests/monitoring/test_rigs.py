@@ -282,3 +282,16 @@ def test_every_frame_is_of_one_observation_in_the_order_of_time(views):
     assert [row[0] for row in seen] == sorted(row[0] for row in seen)
     assert {row[1:] for row in seen} == {(v, k) for v in range(views) for k in range(90)}
     assert len(seen) == 90 * views
+
+
+@pytest.mark.parametrize(("types", "views"), [("R", 2), ("P", 2), ("RP", 1)])
+def test_arms_of_one_joint_or_two_are_watched_as_others_are(types, views):
+    rng = np.random.default_rng(3)
+    robot = random_robot(types, rng, markers=8, views=views)
+    q = np.concatenate([trials(robot, frames=8), around(robot, 10, rng)])
+    known = calibrate(robot.observe(q, NOISE[0], rng), types, source="recorded")
+    at = np.repeat(around(robot, 1, rng), 6, axis=0)
+    for shift in (0.0, 5.0):
+        seen = robot.observe(at, NOISE[0], rng)
+        seen.images[:, 0] += shift
+        assert (fault_at_rest(known, seen) is not None) == bool(shift)
