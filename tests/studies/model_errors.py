@@ -219,7 +219,7 @@ def judged(job):
     row |= {"true_rms_px": rms, "ratio": rms / stated, "ratio_worst": rms / np.fmax(stated, worst or 0.0)}
     # Predictions of the true images, and of what is found in them.
     seen, noise = with_corners(setting.arm, setting.ahead, truth, job.corners, rng)
-    scale = 1.0 if sigma is None else np.sqrt(np.mean(sigma[np.isfinite(pixels[..., 0])] ** 2))
+    scale = 1.0 if sigma is None else np.median(sigma[np.isfinite(pixels[..., 0])])
     of_images = max(found.sigma_px, found.sigma_fitted_px) / scale
     noise = of_images * (np.ones(seen.shape[:3]) if sigma is None else noise)
     spread = np.sqrt(variance + noise[:, :, found.marker, None] ** 2)
