@@ -342,7 +342,7 @@ REFUSALS = {
         limit="errors of joints",
     ),
     "erring_joint": Row(
-        "{joints} is off its readings by {amount} rms at {rest} of the {of_rest} poses in which several "
+        "{one_of} is off its readings by {amount} rms at {rest} of the {of_rest} poses in which several "
         "joints move, and not in trials of single joints",
         "look at its gear and its encoder, and record poses in which all joints move "
         "(calibration.random_poses), which tell errors that repeat",

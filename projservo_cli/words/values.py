@@ -313,6 +313,7 @@ VALUES: dict[str, Callable[[Told], object]] = {
     "of": lambda told: told.subject.joints,
     "name": lambda told: told.subject.name,
     "joints": _joints,
+    "one_of": lambda told: told["joints"] if told.single else f"one of {told['joints']}",
     "it": lambda told: "it" if told.single else "each",
     "moves": lambda told: "moves" if told.single else "move",
     "reads": lambda told: "it reads" if told.single else "they read",

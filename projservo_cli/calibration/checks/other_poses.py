@@ -62,7 +62,10 @@ def on_shown_poses(detections: Detections, shown: IntArray) -> Iterator[Finding]
 
 
 def erring_joint(solution: Solution, poses: IntArray) -> Finding | None:
-    """Find the one joint whose readings alone are off at poses, by rows, that a fit rejects."""
+    """Find the one joint whose readings alone are off at poses, by rows, that a fit rejects.
+
+    Of joints with parallel axes several explain them.
+    """
     solution = solution.thinned(_ORDERED)
     params, detections = dataclasses.replace(solution.params, offsets=None), solution.problem.detections
     there = solution.problem.with_noise(None).rows(np.flatnonzero(np.isin(detections.pose_of, poses)))
@@ -76,13 +79,12 @@ def erring_joint(solution: Solution, poses: IntArray) -> Finding | None:
             off -= here.at_poses((G * r).sum(axis=(0, 2))) / np.maximum(square, 1e-300)
         level = float(np.median(np.linalg.norm(r, axis=2)[seen]))
         tried.append((np.nan_to_num(level, nan=np.inf), i, float(np.sqrt(np.mean(off[poses] ** 2)))))
-    tried.sort()
-    explained = EXPLAINED * RAYLEIGH * solution.sigma_px
-    if tried[0][0] > explained or (len(tried) > 1 and tried[1][0] < _CLEARER * tried[0][0]):
+    level, best, amount = min(tried)
+    alike = sorted(i for own, i, _ in tried if own <= _CLEARER * level)
+    if level > EXPLAINED * RAYLEIGH * solution.sigma_px or len(alike) == len(tried) > 1:
         return None
-    _, i, amount = tried[0]
-    subject = Subject(joints=(int(detections.numbers[i]),))
-    return Finding("erring_joint", REFUSES, subject, amount, unit=detections.units[i])
+    subject = Subject(joints=tuple(sorted(detections.numbers[alike].tolist())))
+    return Finding("erring_joint", REFUSES, subject, amount, unit=detections.units[best])
 
 
 def other_order(solution: Solution, poses: IntArray) -> bool:
