@@ -24,7 +24,7 @@ from projservo_cli.findings import REFUSES, Finding, Subject
 from projservo_cli.records import TOOL, WORLD, FloatArray, WorkFailed, letters_of
 
 # Number of relabellings of a kind that are fitted completely, and minimum share of detections that fit them.
-_FOLLOWED, _KEPT = 2, 0.8
+_FOLLOWED, _KEPT = 3, 0.8
 # Images that come one pose late, or early, from a pose on; number of poses that are tried if none is known.
 _SHIFTED, _ONSETS = ("images_late_from", "images_early_from"), 8
 # Shares of the image before that a tracker keeps, of those tried.
