@@ -27,8 +27,8 @@ from projservo_cli.records import TOOL, WORLD, FloatArray, WorkFailed, letters_o
 _FOLLOWED, _KEPT = 3, 0.8
 # Images that come one pose late, or early, from a pose on; number of poses that are tried if none is known.
 _SHIFTED, _ONSETS = ("images_late_from", "images_early_from"), 8
-# Shares of the image before that a tracker keeps, of those tried.
-_SHARES = (0.03, 0.07, 0.15)
+# Shares of the image before that a tracker keeps, of those tried, and maximum share.
+_SHARES, _MOST_KEPT = (0.03, 0.07, 0.15), 0.5
 # Number of adjustment steps of the screws by which they are compared before.
 _SCREW_STEPS = 8
 # Log residual added to a joint of the other type, which explains more: one that stands still is simpler.
@@ -98,10 +98,11 @@ class _Data(NamedTuple):
         share, used = one.finding.amount, found.used[..., None]
         predicted = found.problem.with_noise(None).pixels(dataclasses.replace(found.params, offsets=None))[0]
         # Without one half they change by as much as they differ from those before.
-        apart = (self.remembered(0.5).detections.pixels - self.detections.pixels) * used
-        off = (predicted - one.detections.pixels) * used
-        step = (1.0 - share) ** 2 * float((off * apart).sum() / np.square(apart).sum())
-        return self.remembered(share + step)
+        apart = np.where(used, self.remembered(0.5).detections.pixels - self.detections.pixels, 0.0)
+        off = np.where(used, predicted - one.detections.pixels, 0.0)
+        step = (1.0 - share) ** 2 * float((off * apart).sum()) / max(float(np.square(apart).sum()), 1e-300)
+        # Beyond, images show no other pose before, or another fault.
+        return self.remembered(share + step) if 0.0 < share + step < _MOST_KEPT else one
 
     def of_joint(self, *joints: int, name: str = "") -> Subject:
         """Return joints, by their columns, as the subject of a finding."""
