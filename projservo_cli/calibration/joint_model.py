@@ -2,9 +2,9 @@
 
 Each hypothesis is a row of ``DEVIATIONS`` with functions that add terms to the curve of true joints by
 readings; sag is a deflection of each revolute joint that follows the torque of weights at the tool, or along
-the arm. Automatic choice takes one by one what the
-score tests name, and what explains the images about as well. It keeps the hypothesis that predicts left-out
-poses best, if by more than chance, and stops where none does.
+the arm. Automatic choice takes one by one what the score tests name, and what explains the images about as
+well. It keeps the hypothesis that predicts left-out poses best, if by more than chance, and stops where none
+does.
 """
 
 import dataclasses

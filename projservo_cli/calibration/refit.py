@@ -185,6 +185,13 @@ class _Images:
             variance += ((self.problem.joint_derivative(params) * self.problem.tau) ** 2).sum(axis=(2, 3))
         return np.asarray(np.sqrt(0.5 * variance))
 
+    def near(self, params: Parameters, errors: Errors) -> BoolArray:
+        """Mask (V, N) of detections that noise and covariance explain."""
+        distance = np.linalg.norm(self.problem.residual(params), axis=2)
+        return np.asarray(
+            self.problem.detections.seen & (distance <= OUTLIER * self.deviation(params, errors))
+        )
+
     def errors_of_views(self, params: Parameters, errors: Errors) -> tuple[ViewError, ...]:
         """Distances of all views from their prediction, and the expected ones."""
         found, result = self.problem.detections, []
@@ -263,10 +270,8 @@ def _require_moved(images: _Images, view: str) -> None:
     of_view = views[c.view.index(view)]
     if not np.isfinite(of_view.off_px) or of_view.disagrees:
         return
-    problem, seen = images.problem, images.problem.detections.seen
-    near = np.linalg.norm(problem.residual(params), axis=2) <= OUTLIER * images.deviation(params, errors)
     nothing = np.zeros((*images.problem.detections.pixels.shape, 0))
-    _JointOffsets.of(images, params, errors, seen & near, nothing).require_none(images, view)
+    _JointOffsets.of(images, params, errors, images.near(params, errors), nothing).require_none(images, view)
     told = tuple(one.finding for one in views if np.isfinite(one.off_px))
     raise failed([Finding("unmoved_camera", REFUSES, Subject(views=(view,)), others=told)])
 
@@ -440,13 +445,12 @@ def _require_confirmed(camera: _Camera) -> float:
     unnoticed.
     """
     images, v, params = camera.images, camera.v, camera.params
-    problem, found, c = images.problem, images.problem.detections, images.calibration
+    found, c = images.problem.detections, images.calibration
     name, errors = found.view[v], errors_of_others(c, v)
     for one in images.errors_of_views(params, errors):
         if one.view != name and one.disagrees:
             raise failed([Finding("other_view_off", REFUSES, others=(one.finding,))])
-    near = np.linalg.norm(problem.residual(params), axis=2) <= OUTLIER * images.deviation(params, errors)
-    mask = camera.used | (found.seen & near & (np.arange(len(found.seen)) != v)[:, None])
+    mask = camera.used | (images.near(params, errors) & (np.arange(len(found.seen)) != v)[:, None])
     of_camera = images.by_camera(params, v) @ camera.root
     offsets = _JointOffsets.of(images, params, errors, mask, of_camera)
     offsets.require_none(images, name)

@@ -116,6 +116,7 @@ def asked_in_vain(number):
     before = calibrate(
         robot.observe(q, NOISE_PX, rng), robot.joint_types, source="simulated", sigma_px=NOISE_PX
     )
+    rows = []
     for case in ("slipped", "unmoved"):
         joint, by = int(rng.integers(len(robot.joint_types))), rng.choice([-1, 1]) * rng.uniform(*SLIPS_DEG)
         read = around(robot, 10, rng, np.radians(45), 0.15)
@@ -124,14 +125,10 @@ def asked_in_vain(number):
         row = {"calibration": number, "case": case, "joint": joint + 1, "by_deg": by}
         try:
             refit(before, seen, "left")
-            yield row | {"code": "accepted"}
+            rows.append(row | {"code": "accepted"})
         except WorkFailed as error:
-            yield row | {"code": error.findings[0].code, "reason": str(error)}
-
-
-def rows_in_vain(number):
-    """The same as a list, for another process."""
-    return list(asked_in_vain(number))
+            rows.append(row | {"code": error.findings[0].code, "reason": str(error)})
+    return rows
 
 
 def row_of(*values):
@@ -146,7 +143,7 @@ def main():
     asked = parser.parse_args()
     if asked.wrong:
         rows = written(
-            asked.output, REFUSED, in_two_processes(rows_in_vain, range(asked.calibrations), "refit")
+            asked.output, REFUSED, in_two_processes(asked_in_vain, range(asked.calibrations), "refit")
         )
         for (case, code), count in sorted(Counter((row["case"], row["code"]) for row in rows).items()):
             print(f"{case}: {code} {count}")
