@@ -198,17 +198,16 @@ def _wrong_order(solution: Solution, rejected: BoolArray) -> Finding | None:
     count, others = several.sum(), np.count_nonzero(~several)
     if wrong < _WRONG_POSES or alone * count > _OTHERS_SHARE * wrong * others:
         return None
-    poses, share = (
-        np.flatnonzero(several & lost),
-        Finding("several_joints", amount=int(wrong), limit=int(count), unit="1"),
-    )
-    code = "joint_order" if other_order(solution, poses) else "several_joints"
+    code, poses = "joint_order", np.flatnonzero(several & lost)
+    if not other_order(solution, poses):
+        if wrong < _WRONG_SHARE * count:
+            return None
+        code = "several_joints"
+    of_poses = Finding(code, REFUSES, amount=int(wrong), limit=int(count), unit="1")
     if code == "several_joints" and (one := erring_joint(solution, poses)):
-        return dataclasses.replace(one, others=(share,))
-    if code == "several_joints" and wrong < _WRONG_SHARE * count:
-        return None
+        return dataclasses.replace(one, others=(of_poses,))
     rest = Finding(code, REFUSES, amount=int(alone), limit=int(others), unit="1")
-    return Finding(code, REFUSES, amount=int(wrong), limit=int(count), unit="1", others=(rest,))
+    return dataclasses.replace(of_poses, others=(rest,))
 
 
 def contradiction(
