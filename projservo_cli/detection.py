@@ -8,6 +8,7 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,6 +17,7 @@ from scipy.special import ndtr
 
 from projservo_cli import words
 from projservo_cli.findings import REFUSES, Finding, Subject
+from projservo_cli.geometry.least_squares import Equations, minimize
 from projservo_cli.image_size import natural
 from projservo_cli.records import (
     CORNERS,
@@ -299,47 +301,28 @@ def _edge_model(x: FloatArray, strips: _Strips) -> tuple[FloatArray, FloatArray]
 
 
 def _fitted(x: FloatArray, strips: _Strips, noise: FloatArray, steps: int) -> tuple[FloatArray, FloatArray]:
-    """Edges (S, 6) of least squares by Levenberg–Marquardt steps, together, and their normal matrices.
-
-    All edges of a frame are one array, of which each keeps its own damping; SciPy takes them one by one.
+    """Edges (S, 6) of least squares, all of a frame together, and their normal matrices.
 
     The noise (S,) of grey values sets the weight of a prior on the arcs.
     """
     stiff = np.zeros((len(x), _EDGE))
     stiff[:, -1] = np.square(np.clip(noise, _MIN_NOISE, _RIGID) / _BOW)
 
-    def equations(x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Normal matrices, gradients and sums of squares."""
+    def equations(x: FloatArray) -> Equations:
         r, J = _edge_model(x, strips)
-        flat = r.reshape(len(r), -1, 1)
         A = J @ J.swapaxes(1, 2) + stiff[:, :, None] * np.eye(_EDGE)
         cost = (r * r).sum(axis=(1, 2)) + (stiff * x * x).sum(axis=1)
-        return A, (J @ flat)[..., 0] + stiff * x, cost
+        return Equations(A, (J @ r.reshape(len(r), -1, 1))[..., 0] + stiff * x, cost)
 
-    return _minimized(x, equations, steps, _MIN_BLUR)
+    (x,), there = minimize((x,), equations, partial(_blurred, _MIN_BLUR), steps)
+    return x, there.A
 
 
-def _minimized(
-    x: FloatArray,
-    equations: Callable[[FloatArray], tuple[FloatArray, FloatArray, FloatArray]],
-    steps: int,
-    min_blur: float,
-) -> tuple[FloatArray, FloatArray]:
-    """Parameters (S, p) of least squares by Levenberg–Marquardt steps, the fifth a blur; normal matrices."""
-    identity = np.eye(x.shape[1])
-    A, g, cost = equations(x)
-    damping = np.full(len(x), 1e-3)
-    for _ in range(steps):
-        ridge = damping[:, None] * np.diagonal(A, axis1=1, axis2=2) + 1e-9
-        step = np.linalg.solve(A + ridge[:, :, None] * identity, g[..., None])[..., 0]
-        moved = x - step
-        moved[:, 4] = np.clip(np.abs(moved[:, 4]), min_blur, _MAX_BLUR)
-        new = equations(moved)
-        better = new[2] <= cost
-        x = np.where(better[:, None], moved, x)
-        A, g = np.where(better[:, None, None], new[0], A), np.where(better[:, None], new[1], g)
-        cost, damping = np.where(better, new[2], cost), np.where(better, 0.1 * damping, 10.0 * damping)
-    return x, A
+def _blurred(min_blur: float, step: FloatArray, x: FloatArray) -> tuple[FloatArray]:
+    """Parameters (S, p) after a step; the fifth is a blur, which has limits."""
+    x = x + step
+    x[:, 4] = np.clip(np.abs(x[:, 4]), min_blur, _MAX_BLUR)
+    return (x,)
 
 
 def _first_edges(strips: _Strips) -> FloatArray:
@@ -905,12 +888,12 @@ def _refine_saddles(
     x[:, 0] = (weight * grey).sum(axis=1) / count
     x[:, 1] = (product * (grey - x[:, :1])).sum(axis=1) / np.maximum((product**2).sum(axis=1), 1e-9)
 
-    def equations(x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Normal matrices, gradients and sums of squares."""
+    def equations(x: FloatArray) -> Equations:
         r, J = _saddle_model(x, u, v, grey, weight)
-        return J @ J.swapaxes(1, 2) + 1e-9 * np.eye(_SADDLE), (J @ r[..., None])[..., 0], (r * r).sum(axis=1)
+        there = Equations.of(r, J.swapaxes(1, 2))
+        return there._replace(A=there.A + 1e-9 * np.eye(_SADDLE))
 
-    x, A = _minimized(x, equations, _SADDLE_STEPS, _MIN_BLUR_SADDLE)
+    (x,), there = minimize((x,), equations, partial(_blurred, _MIN_BLUR_SADDLE), _SADDLE_STEPS)
     residual = _saddle_model(x, u, v, grey, weight)[0]
     square = (residual**2).sum(axis=1) / np.maximum(count - _SADDLE, 1.0)
     # Neighbours differ by noise alone: the rest of the residual is of something before the corner.
@@ -920,7 +903,7 @@ def _refine_saddles(
     noise = 0.5 * (both * np.diff(r, axis=2) ** 2).sum(axis=(1, 2)) / np.maximum(both.sum(axis=(1, 2)), 1.0)
     noise *= 1.0 + _CHANCE * np.sqrt(2.0 / count)
     leak = _LEAK_SADDLE[0] * side[at] * ndtr(-_LEAK_SADDLE[1] * side[at] / x[:, 4])
-    variance = np.linalg.inv(A)[:, [2, 3], [2, 3]].mean(axis=1) * square + _SADDLE_FLOOR**2 + leak**2
+    variance = np.linalg.inv(there.A)[:, [2, 3], [2, 3]].mean(axis=1) * square + _SADDLE_FLOOR**2 + leak**2
     good = (count > _SADDLE) & (square - noise < np.square(_MISFIT * x[:, 1])) & (square < x[:, 1] ** 2)
     good &= np.linalg.norm(x[:, 2:4], axis=1) < _FAR_SADDLE * side[at]
     found.pixels[at] += np.where(good[:, None], x[:, 2:4], np.nan)

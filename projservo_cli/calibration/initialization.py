@@ -16,6 +16,7 @@ from projservo_cli.calibration.epipolar import ImageFrame, ImageGeometry, log_di
 from projservo_cli.calibration.prediction import Parameters
 from projservo_cli.geometry.displacements import aligned, cross_matrix
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
+from projservo_cli.geometry.least_squares import Equations, minimize
 from projservo_cli.records import (
     BoolArray,
     FloatArray,
@@ -64,7 +65,7 @@ _STILL = 6.0
 _STILL_SHARE = 0.05
 # Number of random sets of axes to start from.
 _STARTS = 20
-# Maximum number of Levenberg–Marquardt steps on the axes.
+# Maximum number of steps on the axes.
 _TURNS = 60
 # Maximum number of sets of axes that are kept.
 _MAX_SETS = 3
@@ -253,39 +254,24 @@ def _chain(w: FloatArray, q: FloatArray, prismatic: BoolArray) -> FloatArray:
 def _fit_axes(
     w: FloatArray, R: FloatArray, q: FloatArray, prismatic: BoolArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Axes (S, n, 3) and losses (S,): Levenberg–Marquardt for all at once, Cauchy loss on log(R R_predᵀ).
-
-    All random starts S are one array, of which each keeps its own damping; SciPy takes them one by one.
-    """
+    """Axes (S, n, 3) and losses (S,) beside some: Cauchy loss on log(R R_predᵀ), all starts at once."""
     S, n = w.shape[:2]
     away = np.swapaxes(_chain(w, q, prismatic)[:, n], -1, -2) @ R
     base = np.stack([Rotation.from_matrix(rotations).mean().as_matrix() for rotations in away])
-    damping = np.full(S, 1e-2)
-    residual, J = _axis_residuals(w, base, R, q, prismatic)
-    loss, weight = _cauchy(residual)
-    for _ in range(_TURNS):
-        size = J.shape[-1]
-        rows = J.reshape(S, -1, size)
-        weighted = np.swapaxes(rows * np.repeat(weight, 3, axis=1)[..., None], 1, 2)
-        A = weighted @ rows
-        g = (weighted @ residual.reshape(S, -1, 1))[..., 0]
-        A += (damping * np.trace(A, axis1=1, axis2=2) / size + 1e-12)[:, None, None] * np.eye(size)
-        turn = _rotations(np.asarray(-np.linalg.solve(A, g[..., None]).reshape(S, n + 1, 3), float))
-        w_new = np.einsum("snij,snj->sni", turn[:, :n], w)
-        base_new = turn[:, n] @ base
-        residual_new, J_new = _axis_residuals(w_new, base_new, R, q, prismatic)
-        loss_new, weight_new = _cauchy(residual_new)
-        better = loss_new <= loss
-        damping = np.where(better, np.maximum(0.2 * damping, 1e-9), np.minimum(8.0 * damping, 1e6))
-        settled = np.abs(loss - loss_new) < 1e-9 * loss
-        for kept, new in (
-            (w, w_new), (base, base_new), (residual, residual_new), (J, J_new), (loss, loss_new),
-            (weight, weight_new),
-        ):  # fmt: skip
-            kept[better] = new[better]
-        if (settled | (damping >= 1e6)).all():
-            break
-    return w, loss
+
+    def equations(w: FloatArray, base: FloatArray) -> Equations:
+        residual, J = _axis_residuals(w, base, R, q, prismatic)
+        loss, weight = _cauchy(residual)
+        root = np.sqrt(weight)[..., None] / _WIDTH
+        r, J = (root * residual).reshape(S, -1), (root[..., None] * J).reshape(S, -1, J.shape[-1])
+        return Equations.of(r, J)._replace(cost=loss)
+
+    def turned(step: FloatArray, w: FloatArray, base: FloatArray) -> tuple[FloatArray, FloatArray]:
+        turn = _rotations(step.reshape(S, n + 1, 3))
+        return np.einsum("snij,snj->sni", turn[:, :n], w), turn[:, n] @ base
+
+    (w, _), there = minimize((w, base), equations, turned, _TURNS)
+    return w, there.cost
 
 
 def _axis_residuals(

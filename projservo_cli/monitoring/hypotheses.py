@@ -10,6 +10,7 @@ from scipy.linalg import cho_factor, cho_solve, expm
 
 from projservo_cli.calibration.prediction import Parameters, from_reference, in_chain_order
 from projservo_cli.deviations import CHANGES, Deviation
+from projservo_cli.geometry.least_squares import Equations, minimize
 from projservo_cli.image_size import FACTORS
 from projservo_cli.monitoring.frame_pairs import FramePair
 from projservo_cli.monitoring.innovation_tests import ErrorModel, Residual, Sums
@@ -17,8 +18,8 @@ from projservo_cli.records import CORNERS, BoolArray, FloatArray, IntArray
 
 # A point that a cause puts behind a camera is off by so much, px.
 _HIDDEN_PX = 1e3
-# Steps of Gauss and Newton, halvings of each, and the change of parameters that derivatives are taken by.
-_STEPS, _HALVINGS, _EPSILON = 8, 6, 1e-6
+# Steps of a fit, and the change of parameters that derivatives are taken by.
+_STEPS, _EPSILON = 14, 1e-6
 # A cause that changes images by more than this, px, is far off.
 _NEAR_PX = 5.0
 # Causes of several parameters that are fitted, the likeliest after one step; a fall of χ² that ends a fit.
@@ -219,11 +220,16 @@ class Evidence:
         best = int(np.argmin(squares))
         start, cost, falls = cause.starts[best], 0.0, 0.0
         if start.size:
-            _, cost, falls = self._step(cause, start, rows[best])
+            there, cost = self._linearized(cause, start)
+            falls = float(there.g[0] @ np.linalg.solve(there.A[0], there.g[0]))
         return self.before - squares[best] + falls - cost, cause, start
 
-    def _step(self, cause: _Cause, theta: FloatArray, here: FloatArray) -> tuple[FloatArray, float, float]:
-        """Step of Gauss and Newton, cost of the parameters by their prior, and greatest fall of χ²."""
+    def _linearized(self, cause: _Cause, theta: FloatArray) -> tuple[Equations, float]:
+        """Normal equations of one problem, and the cost of the parameters by their prior.
+
+        The nuisance errors are eliminated.
+        """
+        here = self._changed_by(cause, theta)
         F = np.stack(
             [(self._changed_by(cause, theta + h) - here) / _EPSILON for h in _EPSILON * np.eye(theta.size)],
             axis=-1,
@@ -231,13 +237,13 @@ class Evidence:
         r = self._whitened(here)
         size = np.sqrt(np.square(F).sum(axis=(0, 1)) / self._count(cause))  # px rms a unit
         unit = cause.row.size / np.maximum(size, 1e-12)
-        F = self._whitened(F * unit)
+        F = self._whitened(F)
         across = self._beside.T @ F
         solved = cho_solve(self._factor, across)
-        normal = F.T @ F - across.T @ solved + np.eye(theta.size)
-        right = F.T @ r - solved.T @ (self._beside.T @ r + self._known)
-        step = np.linalg.solve(normal, right)
-        return -unit * step, float(np.linalg.slogdet(normal)[1]), float(right @ step)
+        A = F.T @ F - across.T @ solved + np.diag(unit**-2)
+        g = F.T @ r - solved.T @ (self._beside.T @ r + self._known)
+        cost = float(np.linalg.slogdet(A * np.outer(unit, unit))[1])
+        return Equations(A[None], g[None], np.array([self._square(r)])), cost
 
     def _touched(self, cause: _Cause) -> BoolArray:
         """Detections (K, V, m') that a cause touches."""
@@ -249,20 +255,19 @@ class Evidence:
 
     def _fitted(self, cause: _Cause, theta: FloatArray) -> Explanation:
         """Fit of a cause, with the prior of its parameters."""
+        cost = 0.0
+        if theta.size:
+            (ends,), _ = minimize(
+                (theta[None],),
+                lambda thetas: self._linearized(cause, thetas[0])[0],
+                lambda step, thetas: (thetas + step,),
+                _STEPS,
+                enough=_FALLS,
+            )
+            theta = ends[0]
+            cost = self._linearized(cause, theta)[1]
         here = self._changed_by(cause, theta)
-        square, cost = self._square(self._whitened(here)), 0.0
-        for _ in range(_STEPS if theta.size else 0):
-            step, cost, _ = self._step(cause, theta, here)
-            for halved in step * 0.5 ** np.arange(_HALVINGS)[:, None]:
-                there = self._changed_by(cause, theta + halved)
-                less = self._square(self._whitened(there))
-                if less < square:
-                    break
-            else:
-                break
-            fell, theta, here, square = square - less, theta + halved, there, less
-            if fell < _FALLS:
-                break
+        square = self._square(self._whitened(here))
         shift = self.at_first - here
         change = np.square(shift).reshape(*self.seen.shape, 2).sum(axis=-1)
         changed_px = float(np.sqrt(change[change > 0.0].mean())) if change.any() else 0.0

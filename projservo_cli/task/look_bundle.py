@@ -20,6 +20,7 @@ from projservo_cli.calibration.prediction import (
 )
 from projservo_cli.findings import REFUSES, Finding
 from projservo_cli.geometry.displacements import cross_matrix, generators
+from projservo_cli.geometry.least_squares import Equations, minimize
 from projservo_cli.geometry.lens import undistort
 from projservo_cli.metric.frame import ProjectiveParameters, changes_of, invariant_form
 from projservo_cli.records import BoolArray, Calibration, FloatArray, WorkFailed
@@ -32,11 +33,9 @@ _OPEN = 1e-6
 _UNDETERMINED = 0.3
 # Distance of two places of a body over its size, below which they are one.
 _SAME = 0.05
-# Maximum number of steps of a fit, and damping above which none leads down.
-_STEPS, _HOPELESS = 100, 1e8
-# Fall of χ² by the last step, over χ² and as of round-off.
-_SETTLED, _EXACT = 1e-10, 1e-16
-# Least damping, and least eigenvalue of second derivatives by coordinates of unit deviation.
+# Maximum number of steps of a fit.
+_STEPS = 100
+# Least eigenvalue of second derivatives by coordinates of unit deviation.
 _REGULAR = 1e-12
 # Number of steps from all turns, and of places that are then followed to the end.
 _FIRST_STEPS, _PLACES = 12, 6
@@ -207,28 +206,17 @@ class Bundle(NamedTuple):
     def settled(
         self, X: FloatArray, T: FloatArray, steps: int = _STEPS
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Points, displacements and sums of squares (B,) at a minimum, by Levenberg–Marquardt steps."""
-        damping, (r, J) = np.full(len(X), 1e-3), self.linearized(X, T)
-        cost = (r**2).sum(axis=1)
-        for _ in range(steps):
-            J, size = _unit_columns(J)
-            N = J.swapaxes(1, 2) @ J + damping[:, None, None] * np.eye(J.shape[2])
-            gradient = (J.swapaxes(1, 2) @ r[..., None])[..., 0]
-            step = np.linalg.solve(N, gradient[..., None])[..., 0]
-            expected = (step * gradient).sum(axis=1)
-            with np.errstate(all="ignore"):
-                X_new, T_new = self.moved(X, T, step / size)
-                cost_new = np.nan_to_num((self.residuals(X_new, T_new)[0] ** 2).sum(axis=1), nan=np.inf)
-            better = cost_new < cost
-            small = np.where(better, cost - cost_new, expected) <= _SETTLED * cost + _EXACT
-            ended = small | (damping > _HOPELESS)
-            X, T = np.where(better[:, None, None], X_new, X), np.where(better[:, None, None, None], T_new, T)
-            cost = np.where(better, cost_new, cost)
-            damping = np.where(better, np.maximum(0.1 * damping, _REGULAR), 10.0 * damping)
-            if ended.all():
-                break
+        """Points, displacements and sums of squares (B,) at a minimum, from each start."""
+
+        def equations(X: FloatArray, T: FloatArray) -> Equations:
             r, J = self.linearized(X, T)
-        return X, T, cost
+            return Equations.of(-r, J)
+
+        def moved(step: FloatArray, X: FloatArray, T: FloatArray) -> tuple[FloatArray, FloatArray]:
+            return self.moved(X, T, step)
+
+        (X, T), there = minimize((X, T), equations, moved, steps)
+        return X, T, there.cost
 
     def poses(self, X: FloatArray, turns: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Displacements (h, 4, 4) of known points X (k, 4) in one look, and χ² (h,): minima, least first.
@@ -257,12 +245,6 @@ class Bundle(NamedTuple):
             if ahead[i] and all(differ(there[i], there[j]) for j in kept):
                 kept.append(i)
         return ends[kept, 0], cost[kept]
-
-
-def _unit_columns(J: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Derivatives (…, N, p) over the norms of their columns, and these (…, p)."""
-    size = np.maximum(np.linalg.norm(J, axis=-2), 1e-300)
-    return J / size[..., None, :], size
 
 
 def differ(X: FloatArray, Y: FloatArray) -> bool:
@@ -304,7 +286,7 @@ class BundleFit:
 
         What noise has bent looks better determined than it is: the residuals tell.
         """
-        J, size = _unit_columns(self.linearized()[1])
+        size = np.maximum(np.linalg.norm(self.linearized()[1], axis=0), 1e-300)
         p = len(size)
         step = np.concatenate([np.eye(p), -np.eye(p)]) * (_PROBE / size)
         X, T = (np.broadcast_to(part, (len(step), *part.shape)) for part in (self.X, self.T))
