@@ -31,11 +31,12 @@ class Deviation(NamedTuple):
     cause: str = ""  # code of another row that has the same cause
     code: str = ""  # of findings on it, where it is not the key of the row
     contains: tuple[str, ...] = ()  # rows that it explains as well, with more parameters
+    undone: bool = False  # whether images that it takes far are taken back before the last of a fit
 
 
-def _since(part: str, unit: str, code: str, *contains: str) -> Deviation:
+def _since(part: str, unit: str, code: str, *contains: str, undone: bool = False) -> Deviation:
     """Return a row that changes images by 30 px rms or so since the calibration."""
-    return Deviation(part, unit, 30.0, code=code, contains=contains)
+    return Deviation(part, unit, 30.0, code=code, contains=contains, undone=undone)
 
 
 # Functions of a reading from the reference, in the order of files, as texts name them.
@@ -80,15 +81,15 @@ DEVIATIONS = {
 CURVES = tuple(code for code, row in DEVIATIONS.items() if row.curve)
 _OF_IMAGE = ("shifted", "cropped", "focused", "sized", "camera")
 CHANGES = {
-    "exchanged": _since(VIEW, PX, "exchanged_cameras"),
-    "mirrored": _since(JOINT, NONE, "mirrored_joint"),
-    "slipped": _since(JOINT, READING, "slipped_joint", "mirrored"),
+    "exchanged": _since(VIEW, PX, "exchanged_cameras", undone=True),
+    "mirrored": _since(JOINT, NONE, "mirrored_joint", undone=True),
+    "slipped": _since(JOINT, READING, "slipped_joint", "mirrored", undone=True),
     "frozen": _since(JOINT, NONE, "frozen_reading"),
     "flexible": _since(JOINT, PX, "flexing_links", "slipped"),
     "late": _since(VIEW, SECONDS, "late_images"),
     "shifted": _since(VIEW, PX, "displaced_camera"),
     "cropped": _since(VIEW, PX, "cropped_images"),
-    "sized": _since(VIEW, NONE, "resized_images"),
+    "sized": _since(VIEW, NONE, "resized_images", undone=True),
     "focused": _since(VIEW, SHARE, "refocused_camera", "shifted", "cropped"),
     "camera": _since(VIEW, PX, "displaced_camera", *_OF_IMAGE),
     "cameras": _since(VIEW, PX, "displaced_camera", *_OF_IMAGE, "rig"),

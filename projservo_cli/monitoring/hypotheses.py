@@ -189,7 +189,7 @@ class Evidence:
         The fit takes observations back to the state without the cause, and fits its remainder there.
         """
         kind, changed = fit.cause.kind, fit.cause.change(self.nothing, fit.theta)
-        if kind not in ("exchanged", "mirrored", "slipped", "sized") or fit.changed_px < _NEAR_PX:
+        if not fit.cause.row.undone or fit.changed_px < _NEAR_PX:
             return fit
         # What each view shows as it was calibrated: of an exchange another one, of other markers.
         order = np.argsort(fit.cause.views) if kind == "exchanged" else np.arange(self.seen.shape[1])

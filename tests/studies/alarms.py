@@ -59,7 +59,7 @@ def joint_slipped(rng, at, way):
     """A joint slips by 3 degrees on its encoder."""
     joint, by = int(rng.integers(1, way.q.shape[1] + 1)), int(rng.choice([-3, 3]))
     key = f"disturbance.joint_moved={{at_step: {at}, joint: {joint}, by_deg: {by}, encoder_slip: true}}"
-    return key, rf"joint {joint} slipped by {'-' * (by < 0)}(2\.[5-9]|3|3\.[0-4]) deg"
+    return key, rf"joint {joint} slipped by {'-' * (by < 0)}(2\.[5-9]\d*|3(\.[0-4]\d*)?)°"
 
 
 def reading_frozen(rng, at, way):

@@ -246,8 +246,9 @@ def _of_view(
         columns[v] = change * detections.weight[v][:, None, None]
         found.append(_Nuisance(kind, (), v, columns, *DEVIATIONS[kind].times))
 
-    add("camera_drift", image_motions(x))
-    add("camera_step", image_motions(x))
+    motions = image_motions(x)
+    add("camera_drift", motions)
+    add("camera_step", motions)
     if images.by_lens is None:
         square = (x**2).sum(axis=1)[:, None, None]
         add("lens", x[..., None] * np.concatenate([square, square**2], axis=2))
