@@ -355,9 +355,10 @@ def _joint_causes(evidence: Evidence) -> Iterator[_Cause]:
         yield _Cause("mirrored", i, _start(0), partial(mirrored, i=i))
         starts = _start(1) if evidence.prismatic[i] else np.concatenate([_start(1), turns])
         yield _Cause("slipped", i, starts, partial(slipped, i=i))
-    still: BoolArray = np.ptp(q, axis=(0, 1)) <= _STILL
+    still, lately = np.ptp(q, axis=(0, 1)) <= _STILL, np.ptp(q[K // 2 :], axis=(0, 1)) <= _STILL
     if K > 1 and not still.all():
-        for i in np.flatnonzero(still).tolist():
+        # The first images may show what was before: an onset is told by what disagrees, and images are late.
+        for i in np.flatnonzero(still | (lately & (not lately.all()))).tolist():
             yield _Cause("frozen", i, _start(K), partial(frozen, which=slice(i, i + 1)))
     elif K > 2:
         yield _Cause("frozen", ALL, _start(n * K), partial(frozen, which=slice(n)))

@@ -33,11 +33,8 @@ def several(seed, count=6):
     """Noisy values of decays, and starts that are 30 % off."""
     rng = np.random.default_rng(seed)
     true = rng.uniform([0.5, 0.3, -1.0], [3.0, 2.0, 1.0], (count, 3))
-    return (
-        true,
-        decays(true)[0] + 0.01 * rng.normal(size=(count, 25)),
-        true * rng.uniform(0.7, 1.3, (count, 3)),
-    )
+    values = decays(true)[0] + 0.01 * rng.normal(size=(count, 25))
+    return values, true * rng.uniform(0.7, 1.3, (count, 3))
 
 
 @given(st.integers(0, 1000))

@@ -109,6 +109,20 @@ def test_a_joint_of_the_other_sign_that_puts_all_markers_behind_the_camera_expla
     assert mirrored.gain < 0.0
 
 
+def test_a_reading_that_moved_before_the_onset_may_stand_still_since(case):
+    """Images are late, so that the first which disagree show a joint that still moved."""
+    q, shape = case.q[ONSET : ONSET + 4].copy(), case.s.shape[1:3]
+    q[1:, 1] = q[1, 1]
+    assert abs(q[0, 1] - q[1, 1]) > 1e-6
+    errors = innovation_tests.ErrorModel(case.calibration, NOISE[0])
+    images = case.robot.images(case.q[ONSET : ONSET + 4])
+    pairs = [FramePair.at_rest(*one, np.full(shape, NOISE[0])) for one in zip(q, images, strict=True)]
+    residuals = [errors.residual(pair) for pair in pairs]
+    evidence = Evidence(errors, pairs, residuals, np.ones(4), errors.nothing())
+    frozen = [one.which for one in causes_of(evidence, case.calibration.marker, None) if one.kind == "frozen"]
+    assert frozen == [1]
+
+
 def change(case, **parts):
     """Pixels by which images change where parts of the robot are others."""
     return dataclasses.replace(case.robot, **parts).images(case.q) - case.robot.images(case.q)
