@@ -75,8 +75,8 @@ class Incidences(NamedTuple):
     # tool, point of the scene, and a sense of −1; then the offset of e = bᵀA − offset, the number of the
     # incidence, and the weight of e in each of w independent errors
     rows: FloatArray
-    # (g, 10) direction or plane of the tool at the reference, that of the scene with the same sense, 1 for
-    # planes, and the error of half a turn, px
+    # (g, 10) direction or plane of the tool at the reference, the direction of the scene, or across its plane,
+    # to which that of the tool is to point, 1 for planes, and the error of half a turn, px
     senses: FloatArray
     # (5 + V,) plane a of the face at the reference, number of markers of the body at the goal, once a view,
     # and a·O of each view there, in the frame of the body
@@ -270,6 +270,14 @@ def _rows(one: Incidence, model: Model, tool: FloatArray, scene: FloatArray) -> 
     return [(axes[0], metric.along(axes[1]), 1.0, product)]
 
 
+def _across(model: Model, body: Body, plane: FloatArray) -> FloatArray:
+    """Direction (4,) to the positive side of a plane (4,), its normal where the joints preserve a metric."""
+    try:
+        return JointMetric(model, "a sense").normal(plane)
+    except InputError:
+        return np.asarray(body.D.T @ (body.D @ plane))
+
+
 def _has_sense(one: Incidence, tool: FloatArray, scene: FloatArray) -> bool:
     """Whether both point the same way: lines or planes that meet or are parallel."""
     return one.relation in (MEET, PARALLEL) and len(tool) == len(scene) > 1
@@ -296,7 +304,8 @@ def incidences_of(model: Model, body: Body, H_taught: FloatArray, asked: Sequenc
         if _has_sense(one, tool, scene):
             plane = len(tool) == len(KINDS)
             axes = [plane_through(points) if plane else _directions(points)[0] for points in (tool, scene)]
-            senses.append(np.array([[*axes[0], *axes[1], plane, 0.0]]))
+            to = _across(model, body, axes[1]) if plane else axes[1]
+            senses.append(np.array([[*axes[0], *to, plane, 0.0]]))
     return NO_INCIDENCES._replace(rows=np.array(rows), senses=np.concatenate(senses))
 
 

@@ -198,6 +198,20 @@ def test_what_points_the_other_way_is_not_met(flat, axis):
     assert image_error_at(case.rows, np.eye(4)) < 1e-9
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_the_sense_of_parallel_planes_does_not_depend_on_where_they_are(seed):
+    """Moved apart, to either side, they are alike; half a turn about a direction in them is told."""
+    model, M = random_arm(np.random.default_rng(5))
+    G = frame(seed)
+    case = Case(model, M, [Incidence("a on b", PLANE, PLANE, PARALLEL)], model.q_reference, G)
+    along = M[5, :3] - M[4, :3]
+    half = expm(np.pi * hat(along / np.linalg.norm(along), np.cross(M[4, :3], along / np.linalg.norm(along))))
+    for by in 5.0 * np.random.default_rng(seed).normal(size=(20, 3)):
+        apart = G @ displacement(np.zeros(3), by) @ np.linalg.inv(G)
+        assert image_error_at(case.rows, apart) < 1e-6
+        assert image_error_at(case.rows, apart @ G @ half @ np.linalg.inv(G)) > 50.0
+
+
 def test_distances_and_angles_are_those_of_the_metric():
     """Of a tool that was displaced in the metric frame, in any other, up to the scale of both."""
     generator = np.random.default_rng(11)
