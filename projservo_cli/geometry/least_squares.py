@@ -13,7 +13,7 @@ import numpy as np
 from projservo_cli.records import BoolArray, FloatArray
 
 # Damping at first, least and most of all: none that is larger leads down where this one does not.
-_AT_FIRST, _LEAST, _HOPELESS = 1e-3, 1e-12, 1e8
+_AT_FIRST, _LEAST, _HOPELESS = 1e-3, 1e-9, 1e8
 # Fall of a cost by the last step, over the cost and as of round-off.
 _SETTLED, _EXACT = 1e-10, 1e-16
 # Second derivative over the largest, below which nothing shows a parameter.

@@ -16,8 +16,10 @@ from projservo_cli.task.incidences import Incidences, image_error_at, linearized
 # Starts of Newton's method around the start, around the goal that was taught, and between the limits; their
 # deviation around these, rad or m.
 _AROUND, _ANYWHERE, _SPREAD = 24, 24, 0.5
-# Newton steps, the longest of a joint, rad or m, and the image error, px, at which all incidences hold.
-_STEPS, _STRIDE, MET_PX = 40, 0.4, 1e-6
+# Newton steps, the longest of a joint, rad or m, and the image error, px, at which they hold exactly.
+_STEPS, _STRIDE, _MET_PX = 40, 0.4, 1e-6
+# What noise may leave over the least, of goals that are met as well.
+_AS_WELL = 1.01
 # Margin over that asked for, from which more of it counts no more.
 _AMPLE = 10.0
 # Difference of joints, rad or m, below which goals are one.
@@ -53,11 +55,17 @@ def _joints_meeting(
 
 
 def goals_meeting(
-    c: Constraints, incidences: Incidences, q_start: FloatArray, taught: FloatArray, seed: int
+    c: Constraints,
+    incidences: Incidences,
+    q_start: FloatArray,
+    taught: FloatArray,
+    seed: int,
+    most_px: float,
 ) -> tuple[FloatArray, FloatArray]:
     """Return joints (g, n) at which all incidences hold, the best first, and those that come nearest (n,).
 
-    The best are in sight, then soon reached with margins. Goals that show less come after the others.
+    The best are in sight, then soon reached with margins. Goals that show less come after the others. Where
+    none is exact, as with fewer joints than rows, the nearest ones hold that leave no more than ``most_px``.
 
     taught : (l, n) joints where the goal was taught; seed : of the starts.
     """
@@ -67,15 +75,14 @@ def goals_meeting(
     starts += [*(near + _SPREAD * generator.standard_normal((_AROUND, n)) for near in starts)]
     if np.isfinite(low).all() and np.isfinite(high).all():
         starts.append(generator.uniform(low, high, (_ANYWHERE, n)))
+    ends = np.array([_joints_meeting(c.model, incidences, start, low, high) for start in np.vstack(starts)])
+    left = np.array([image_error_at(incidences, forward_kinematics(c.model, q)) for q in ends])
+    nearest = ends[int(np.argmin(left))]
+    within = max(_MET_PX, _AS_WELL * float(left.min())) if left.min() <= most_px else _MET_PX
     found: list[FloatArray] = []
     rank: list[tuple[bool, float]] = []
-    nearest, least = q_start, np.inf
-    for start in np.vstack(starts):
-        q = _joints_meeting(c.model, incidences, start, low, high)
-        left = image_error_at(incidences, forward_kinematics(c.model, q))
-        if left < least:
-            nearest, least = q, left
-        if left > MET_PX or any(np.abs(q - other).max() < _DISTINCT for other in found):
+    for q in ends[left <= within]:
+        if any(np.abs(q - other).max() < _DISTINCT for other in found):
             continue
         found.append(q)
         share = _share(c, q)

@@ -20,7 +20,7 @@ from projservo_cli.loop.rehearsal import begin
 from projservo_cli.monitoring.accuracy import RigidFit, metric_points, rigid_fit
 from projservo_cli.monitoring.at_rest import fault_at_rest
 from projservo_cli.planning.constraints import constraints_of
-from projservo_cli.planning.goal_sets import MET_PX, goals_meeting
+from projservo_cli.planning.goal_sets import goals_meeting
 from projservo_cli.planning.margins import Demands, Motion, Reaching, best_views
 from projservo_cli.planning.shown_joints import NEAR_PX, joints_showing
 from projservo_cli.records import (
@@ -52,6 +52,7 @@ from projservo_cli.stages.motions import (
 from projservo_cli.stages.plan_summary import findings_on, relaxed, search_summary, verdict_of
 from projservo_cli.stages.scenario import Scenario, scenario_of
 from projservo_cli.stages.stage_inputs import PlanInputs
+from projservo_cli.task.contradictions import contradictions
 from projservo_cli.task.face import Task, center_of, face_plane
 from projservo_cli.task.incidences import errors_px, linearized
 from projservo_cli.task.partition import Parts
@@ -172,17 +173,21 @@ def _to_any_goal(scenario: Scenario) -> Plan:
     """
     model, ends = scenario.model, scenario.ends
     state, task, _, _ = _partitioned(model, ends, scenario.inputs.trajectory, scenario.demands.limits)
+    names, H_taught = tuple(one.name for one in ends.incidences), ends.displacement_taught(model)
+    apart = tuple(contradictions(task.incidences, names, task.body, H_taught, scenario.goal_error_px))
+    if not usable(apart):
+        raise failed([one for one in apart if one.severity == REFUSES])
     body = body_at_start(model, task, ends, state.A)
     c = constraints_of(model, body, task, ends.q_start, scenario.demands)
     seed = scenario.inputs.trajectory.search.seed
-    goals, nearest = goals_meeting(c, task.incidences, ends.q_start, scenario.goal_joints, seed)
-    names = tuple(one.name for one in ends.incidences)
+    goals, nearest = goals_meeting(c, task.incidences, ends.q_start, scenario.goal_joints, seed, _LEFT_PX)
     if not len(goals):
         (left,) = errors_px(task.incidences, forward_kinematics(model, nearest)[None])
+        each = sorted(zip(left.tolist(), names, strict=True), reverse=True)
         missed = [
-            Finding("incidence", subject=Subject(name=name), amount=px, limit=MET_PX, unit="px")
-            for name, px in zip(names, left.tolist(), strict=True)
-            if px > MET_PX
+            Finding("incidence", subject=Subject(name=name), amount=px, limit=_LEFT_PX, unit="px")
+            for px, name in each
+            if px > min(_LEFT_PX, 0.5 * each[0][0])
         ]
         raise failed([Finding("unmet_incidences", REFUSES, others=tuple(missed))])
     plans, failures = [], []
@@ -202,7 +207,9 @@ def _to_any_goal(scenario: Scenario) -> Plan:
             break
     if not plans:
         raise failures[0]
-    return plans[-1] if plans[-1].feasible else plans[0]
+    best = plans[-1] if plans[-1].feasible else plans[0]
+    reason = "; ".join((best.reason, *lines(apart, _setup(ends))))
+    return replace(best, reason=reason, findings=best.findings + apart)
 
 
 def _borders(inputs: PlanInputs, view: Sequence[str]) -> Iterator[Finding]:

@@ -208,6 +208,12 @@ class Scenario:
         return self.noise_px / math.sqrt(self.inputs.averaged_frames) if stated is None else stated
 
     @property
+    def goal_error_px(self) -> float:
+        """Standard deviation of a coordinate of the goal by its images and the calibration, px."""
+        calibrated = None if self.calibration is None else self.calibration.predicted_rms_px
+        return math.hypot(self.goal_sigma_px, math.sqrt(0.5) * (calibrated or 0.0))
+
+    @property
     def goal_images(self) -> GoalImages | None:
         """Images of the goal that are given."""
         return None if self.inputs.task is None else self.inputs.task.goal.images

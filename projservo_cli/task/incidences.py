@@ -18,12 +18,14 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import null_space, qr
+from scipy.spatial.transform import Rotation
 
 from projservo_cli.geometry.algebra import Mat4, apply, apply_transposed, as_array, dot, mat, meet, unit, vec
 from projservo_cli.geometry.displacements import twist_exponential
 from projservo_cli.geometry.jit import inline, merged, njit
 from projservo_cli.geometry.kernels import COORDINATES
 from projservo_cli.geometry.kinematics import image_jacobian, project
+from projservo_cli.geometry.least_squares import Equations, minimize
 from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.metric.frame import invariant_upgrade
 from projservo_cli.records import (
@@ -50,6 +52,9 @@ _STEPS, _STRIDE, _SETTLED, _SINGULAR = 50, 0.5, 1e-12, 1e-9
 # that leads away from there.
 _FAR, _NUDGE = 1e6, 0.1
 
+# Turns to all sides, (24, 3) rotation vectors: none is farther than 63° from one.
+_TURNS = Rotation.create_group("O").as_rotvec()
+
 # Measure (p, 6) of motions (6, 4, 4) of points (m, 4).
 _Moved = Callable[[FloatArray, FloatArray], FloatArray]
 Flat = tuple[tuple[int, ...], ...]  # positions of markers in the body; a point is the middle of some
@@ -75,8 +80,9 @@ class Incidences(NamedTuple):
     # tool, point of the scene, and a sense of −1; then the offset of e = bᵀA − offset, the number of the
     # incidence, and the weight of e in each of w independent errors
     rows: FloatArray
-    # (g, 10) direction or plane of the tool at the reference, the direction of the scene, or across its plane,
-    # to which that of the tool is to point, 1 for planes, and the error of half a turn, px
+    # (g, 11) direction or plane of the tool at the reference, the direction of the scene, or across its
+    # plane, to which that of the tool is to point, 1 for planes, the number of the incidence, and the error
+    # of half a turn, px
     senses: FloatArray
     # (5 + V,) plane a of the face at the reference, number of markers of the body at the goal, once a view,
     # and a·O of each view there, in the frame of the body
@@ -95,9 +101,9 @@ class Incidences(NamedTuple):
 # Columns of the rows: of the tool, then of the scene, and these.
 _SCENE, _SENSE, _OFFSET, _GROUP, _WEIGHT = 4, 8, 9, 10, 11
 # Columns of the senses after those of the tool and the scene, and entries of the sight after the plane.
-_IS_PLANE, _TURN_PX = 8, 9
+_IS_PLANE, _OF, _TURN_PX = 8, 9, 10
 _VIEWS_USED, SHOWN = 4, 5
-NO_INCIDENCES = Incidences(rows=np.zeros((0, _WEIGHT)), senses=np.zeros((0, 10)), sight=np.zeros(5))
+NO_INCIDENCES = Incidences(rows=np.zeros((0, _WEIGHT)), senses=np.zeros((0, 11)), sight=np.zeros(5))
 
 
 @inline
@@ -125,6 +131,13 @@ def _rate_of(row: FloatArray, H: Mat4, H_back: Mat4, H_hat: Mat4) -> float:
     return -dot(vec(row), apply(H_back, apply(H_hat, vec(row[_SCENE:]))))
 
 
+@merged
+def _points_away(sense: FloatArray, H: Mat4, H_back: Mat4) -> bool:
+    """Whether a direction or plane of the tool points the other way than it should at H."""
+    moved = apply_transposed(H_back, vec(sense)) if sense[_IS_PLANE] > 0.0 else apply(H, vec(sense))
+    return dot(moved, vec(sense[_SCENE:])) < 0.0
+
+
 @njit
 def image_error(incidences: Incidences, H: Mat4, H_back: Mat4) -> float:
     """Least motion of the images of the body that meets all incidences, px rms per marker and view.
@@ -138,11 +151,7 @@ def image_error(incidences: Incidences, H: Mat4, H_back: Mat4) -> float:
             error += rows[i, _WEIGHT + k] * _error_of(rows[i], H, H_back)
         total += error * error
     for sense in incidences.senses:
-        if sense[_IS_PLANE] > 0.0:
-            moved = apply_transposed(H_back, vec(sense))
-        else:
-            moved = apply(H, vec(sense))
-        if dot(moved, vec(sense[_SCENE:])) < 0.0:
+        if _points_away(sense, H, H_back):
             total += sense[_TURN_PX] * sense[_TURN_PX]
     return math.sqrt(total / incidences.sight[_VIEWS_USED])
 
@@ -305,7 +314,7 @@ def incidences_of(model: Model, body: Body, H_taught: FloatArray, asked: Sequenc
             plane = len(tool) == len(KINDS)
             axes = [plane_through(points) if plane else _directions(points)[0] for points in (tool, scene)]
             to = _across(model, body, axes[1]) if plane else axes[1]
-            senses.append(np.array([[*axes[0], *to, plane, 0.0]]))
+            senses.append(np.array([[*axes[0], *to, plane, k, 0.0]]))
     return NO_INCIDENCES._replace(rows=np.array(rows), senses=np.concatenate(senses))
 
 
@@ -367,7 +376,7 @@ def _independent(half: FloatArray) -> FloatArray:
 
 
 def _turn_px(sense: FloatArray, H: FloatArray, turns: FloatArray, J: FloatArray) -> float:
-    """Motion of all images, px, by half a turn of a direction or plane (10,): as far as to first order.
+    """Motion of all images, px, by half a turn of a direction or plane (11,): as far as to first order.
 
     turns : operators (3, 4, 4) of rotations per rad; J : (2 k, 3) images by them.
     """
@@ -401,6 +410,53 @@ def nearest_goal(incidences: Incidences, body: Body, H: FloatArray, moved: _Move
         if np.linalg.norm(J @ step) <= _SETTLED * np.linalg.norm(J):
             break
     return H
+
+
+def only(incidences: Incidences, numbers: Sequence[int]) -> Incidences:
+    """Return the rows and senses of some incidences, each row by itself."""
+    rows = incidences.rows[np.isin(incidences.rows[:, _GROUP], numbers)]
+    return _unweighted(incidences._replace(rows=rows, senses=_senses_of(incidences, numbers)))
+
+
+def _senses_of(incidences: Incidences, numbers: Sequence[int]) -> FloatArray:
+    """Senses (g, 11) of some incidences."""
+    return incidences.senses[np.isin(incidences.senses[:, _OF], numbers)]
+
+
+def least_errors(incidences: Incidences, body: Body, H: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Displacements (s, 4, 4) beside some at which all rows together err least, and their squares (s,), px².
+
+    incidences : of ``only``; each row that depends on others counts. H : (s, 4, 4). The square of a feature
+    that points the other way is that of half a turn.
+    """
+
+    def equations(H: FloatArray) -> Equations:
+        parts = [linearized(incidences, at, _motions(body, at)) for at in H]
+        e, J = (np.array(part) for part in zip(*parts, strict=True))
+        return Equations.of(e, J)
+
+    def moved(step: FloatArray, H: FloatArray) -> tuple[FloatArray]:
+        turn = np.linalg.norm(step[:, 3:], axis=1, keepdims=True)
+        step = step * _STRIDE / np.maximum(turn, _STRIDE)
+        twists = [np.tensordot(one, _motions(body, at), 1) for one, at in zip(step, H, strict=True)]
+        return (np.array([as_array(twist_exponential(mat(twist))) for twist in twists]) @ H,)
+
+    (H,), there = minimize((H,), equations, moved, _STEPS)
+    turned = [_turned_px(incidences, at) for at in H]
+    return H, there.cost + np.square(turned).sum(axis=1)
+
+
+def _turned_px(incidences: Incidences, H: FloatArray) -> FloatArray:
+    """Errors (g,) of senses at H (4, 4): half a turn where a feature points the other way, else zero, px."""
+    here, back = mat(H), mat(np.asarray(np.linalg.inv(H), dtype=np.float64))
+    away = [_points_away(sense, here, back) for sense in incidences.senses]
+    return np.where(away, incidences.senses[:, _TURN_PX], 0.0)
+
+
+def turned_about(body: Body, H: FloatArray) -> FloatArray:
+    """Displacements (25, 4, 4): H (4, 4), and with it turned about the body's middle to all sides."""
+    turns = np.einsum("bi,ijk->bjk", _TURNS, _motions(body, H)[3:])
+    return np.array([H, *(as_array(twist_exponential(mat(turn))) @ H for turn in turns)])
 
 
 def image_error_at(incidences: Incidences, H: FloatArray) -> float:
@@ -451,13 +507,20 @@ def _angle(tool: FloatArray, scene: FloatArray) -> float:
 def errors_px(incidences: Incidences, H: FloatArray) -> FloatArray:
     """Error (k, g) of each incidence at displacements H (k, 4, 4) over its deviation at one pixel of noise.
 
-    The root of the mean square over its independent rows, px; NaN where a displacement is.
+    The root of the mean square over its independent rows, and half a turn where it points the other way, px;
+    NaN where a displacement is.
     """
     half, group, own = np.linalg.pinv(incidences.weight), incidences.rows[:, _GROUP], list[Incidences]()
     for k in np.unique(group):
         independent = _independent(half[group == k])
         weight = np.zeros((len(independent), len(group)))
         weight[:, group == k] = independent / math.sqrt(len(independent))
-        own.append(incidences.weighing(weight))
+        own.append(incidences.weighing(weight)._replace(senses=_senses_of(incidences, [int(k)])))
     none = np.zeros((0, 4, 4))
-    return np.array([[float(np.linalg.norm(linearized(one, at, none)[0])) for one in own] for at in H])
+
+    def error(one: Incidences, at: FloatArray) -> float:
+        if not np.isfinite(at).all():
+            return math.nan
+        return float(np.linalg.norm([*linearized(one, at, none)[0], *_turned_px(one, at)]))
+
+    return np.array([[error(one, at) for one in own] for at in H])

@@ -98,6 +98,12 @@ OF_GOAL = {
         "choose a goal by joint readings, or one that moves the face as these joints do",
     ),
     "incidence": Row("{name} {amount}"),
+    "incidence_name": Row("{name}"),
+    "contradictory_incidences": Row(
+        "{each} contradict each other: wherever the tool is, its images are {amount} from meeting both, and "
+        "noise explains {limit}",
+        "leave one out, or change what they ask",
+    ),
     "unmet_incidences": Row(
         "no joints within their limits meet all incidences; the nearest leave {unshown}",
         "leave one out, or teach the goal elsewhere",

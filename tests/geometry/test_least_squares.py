@@ -80,3 +80,15 @@ def test_a_step_to_no_value_is_not_taken():
     (x,), there = minimize((start,), equations, lambda step, x: (x + 40.0 * step,), 200)
     assert (x[:, 1] > 0.2).all()
     assert (there.cost <= equations(start).cost).all()
+
+
+def test_directions_that_nothing_shows_make_no_system_singular():
+    """One row of ones and an exact start: the damping falls to its least."""
+
+    def equations(x):
+        return Equations.of(x.sum(axis=1)[:, None] - 1.0, np.ones((len(x), 1, x.shape[1])))
+
+    for start in np.zeros(6), np.arange(6.0):
+        (x,), there = minimize((start[None],), equations, lambda step, x: (x + step,), 60, enough=-1.0)
+        np.testing.assert_allclose(x.sum(), 1.0, atol=1e-12)
+        assert there.cost < 1e-20
