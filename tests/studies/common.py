@@ -23,6 +23,7 @@ from tests.known import configured, with_task
 
 # Configurations with images of 0.5 px noise, each with a seed of its own for its tasks.
 ARMS = {"paper": 151, "ur5": 152, "stanford": 153, "seven": 154}
+SEEDS = ARMS | {"hobby": 155}
 # Paths that are looked for with the true model: joint vectors drawn by each search, and how many searches.
 SAMPLES, SEARCHES = 100_000, 20
 
@@ -31,7 +32,7 @@ def task_configs(name, count, *overrides):
     """Configurations of random tasks of an arm, images and trials at 0.5 px, run k with the seed k."""
     config = configured(name, "noise.calibration_px=0.5", "noise.servo_px=0.5", *overrides)
     front = np.array(config.task.start.values(config.joint_types))
-    tasks = random_tasks(truth_of(config), front, count, np.random.default_rng(ARMS[name]))
+    tasks = random_tasks(truth_of(config), front, count, np.random.default_rng(SEEDS[name]))
     for k, ends in enumerate(zip(*tasks, strict=True)):
         yield with_task(config, ends, seed=k)
 

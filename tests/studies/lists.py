@@ -2,10 +2,10 @@
 
     python -m tests.studies.lists [--tasks 300] [--arms ur5 hobby] [--kinds ...] [-o lists.csv]
 
-Tasks are random ones, images and trials at 0.5 px. A contradictory list has two rows that no place of the tool
-meets: angles that differ by 5° to 60°, a point on two others, on a plane that it is off, or on a line and
-beside it. It is to be refused by these two rows, before any motion. A consistent one holds where the goal was
-taught, and has up to eleven rows for six freedoms, or for the five of an arm of five joints.
+Tasks are random ones, images and trials at 0.5 px. A contradictory list has two rows that no place of the
+tool meets: angles that differ by 5° to 60°, a point on two others, on a plane that it is off, or on a line
+and beside it. It is to be refused by these two rows, before any motion. A consistent one holds where the goal
+was taught, and has up to eleven rows for six freedoms, or for the five of an arm of five joints.
 """
 
 import numpy as np
