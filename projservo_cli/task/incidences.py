@@ -48,6 +48,8 @@ _WANTED = {MEET: 0.0, PARALLEL: 0.0, PERPENDICULAR: 90.0}
 # Newton steps to a displacement at which all incidences hold: how many, the largest turn of one, rad, and the
 # last, over unit motions; singular value over the largest that counts as zero.
 _STEPS, _STRIDE, _SETTLED, _SINGULAR = 50, 0.5, 1e-12, 1e-9
+# Error, over what a unit motion of the body changes, at which a row is met: of round-off.
+_MET = 1e-6
 # Error over what a unit of the measured motion changes, from which no motion lowers it, and the turn, rad,
 # that leads away from there.
 _FAR, _NUDGE = 1e6, 0.1
@@ -389,11 +391,32 @@ def _turn_px(sense: FloatArray, H: FloatArray, turns: FloatArray, J: FloatArray)
 
 
 def nearest_goal(incidences: Incidences, body: Body, H: FloatArray, moved: _Moved) -> FloatArray:
-    """Displacement (4, 4) near H at which all incidences hold, by Gauss and Newton.
+    """Displacement (4, 4) near H at which all incidences hold in their senses, by Gauss and Newton.
 
     moved : measures motions of the body; each step is the least of those that meet the incidences.
-    Incidences that contradict each other leave an error, as of ``image_error``.
+    Where that ends with a feature turned over, or off, the nearest of the places is taken that steps from H,
+    turned to all sides, lead to. Incidences that contradict each other leave an error, as of ``image_error``.
     """
+    found = _stepped_to(incidences, body, H, moved)
+    if _is_met(incidences, body, found):
+        return found
+    starts = turned_about(body, H)[1:]
+    others = [_stepped_to(incidences, body, start, moved) for start in starts]
+    met = [one for one in others if _is_met(incidences, body, one)]
+    if not met:
+        return found
+    return max(met, key=lambda one: float(np.trace(body.D @ np.linalg.inv(H) @ one @ body.D.T)))  # least turn
+
+
+def _is_met(incidences: Incidences, body: Body, H: FloatArray) -> bool:
+    """Whether no feature points the other way, and the rows are met to round-off."""
+    e, B = linearized(_unweighted(incidences), H, _motions(body, H))
+    met = np.abs(e) <= _MET * np.linalg.norm(B, axis=1)
+    return bool(met.all()) and not _away_at(incidences, H).any()
+
+
+def _stepped_to(incidences: Incidences, body: Body, H: FloatArray, moved: _Moved) -> FloatArray:
+    """Displacement (4, 4) to which the least steps from H lead that meet all incidences."""
     rows = incidences if rank_of(incidences) else _unweighted(incidences)
     for _ in range(_STEPS):
         motions = _motions(body, H)
@@ -448,9 +471,13 @@ def least_errors(incidences: Incidences, body: Body, H: FloatArray) -> tuple[Flo
 
 def _turned_px(incidences: Incidences, H: FloatArray) -> FloatArray:
     """Errors (g,) of senses at H (4, 4): half a turn where a feature points the other way, else zero, px."""
+    return np.where(_away_at(incidences, H), incidences.senses[:, _TURN_PX], 0.0)
+
+
+def _away_at(incidences: Incidences, H: FloatArray) -> BoolArray:
+    """Whether features (g,) point the other way at H (4, 4)."""
     here, back = mat(H), mat(np.asarray(np.linalg.inv(H), dtype=np.float64))
-    away = [_points_away(sense, here, back) for sense in incidences.senses]
-    return np.where(away, incidences.senses[:, _TURN_PX], 0.0)
+    return np.array([_points_away(sense, here, back) for sense in incidences.senses], dtype=np.bool_)
 
 
 def turned_about(body: Body, H: FloatArray) -> FloatArray:

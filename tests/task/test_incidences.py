@@ -212,6 +212,23 @@ def test_the_sense_of_parallel_planes_does_not_depend_on_where_they_are(seed):
         assert image_error_at(case.rows, apart @ G @ half @ np.linalg.inv(G)) > 50.0
 
 
+@pytest.mark.parametrize("kind", [(LINE, LINE, MEET), (PLANE, PLANE, MEET), (LINE, LINE, PARALLEL)])
+def test_the_nearest_goal_has_its_features_in_their_sense(kind):
+    """From wherever the body is turned to, and in any frame; the errors of the other sense are told."""
+    for seed in range(4):
+        rng = np.random.default_rng([29, seed])
+        model, M = random_arm(rng)
+        case = Case(model, M, [Incidence("a on b", *kind)], model.q_reference, frame(seed))
+        moved = image_velocities(case.model, np.ones((2, len(M)), dtype=bool))
+        for turn in 3.0 * rng.normal(size=(10, 3)):
+            G = frame(seed)
+            about = M[4, :3]
+            H = displacement(turn, about - displacement(turn, np.zeros(3))[:3, :3] @ about)
+            goal = nearest_goal(case.rows, case.body, G @ H @ np.linalg.inv(G), moved)
+            assert image_error_at(case.rows, goal) < 1e-4
+            assert errors_px(case.rows, goal[None]).max() < 1e-4
+
+
 def test_distances_and_angles_are_those_of_the_metric():
     """Of a tool that was displaced in the metric frame, in any other, up to the scale of both."""
     generator = np.random.default_rng(11)
