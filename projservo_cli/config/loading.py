@@ -323,7 +323,8 @@ class Config(Settings):
 
         Parameters
         ----------
-        values : by key; nested mappings merge, keys with dots such as ``noise.servo_px`` set one value.
+        values : by key; nested mappings merge, keys with dots such as ``noise.servo_px`` set their value as
+            ``--set`` does: ``task.goal`` the whole goal.
 
         Raises
         ------
@@ -436,15 +437,21 @@ def shipped(name: pathlib.Path | str) -> pathlib.Path:
 
 
 def overrides_of(what: str, values: Mapping[str, Any]) -> list["Override"]:
-    """Values as overrides that messages call by ``what``: mappings in mappings, or keys with dots."""
-    found: list[Override] = []
-    for key, value in values.items():
-        if isinstance(value, Mapping):
-            found += overrides_of(what, {f"{key}.{inner}": one for inner, one in value.items()})
-            continue
-        usual = plain(value)
-        found.append(Override(_shortened(f"{what}: {key}={usual!r}"), str(key), usual))
-    return found
+    """Values as overrides that messages call by ``what``: mappings merge, a key with dots sets its value."""
+    return [
+        Override(_shortened(f"{what}: {key}={usual!r}"), key, usual)
+        for name, value in ((str(key), value) for key, value in values.items())
+        for key, usual in ([(name, plain(value))] if "." in name else _leaves(name, value))
+    ]
+
+
+def _leaves(key: str, value: Any) -> Iterator[tuple[str, Any]]:
+    """Yield the values of mappings in mappings, by keys with dots."""
+    if not isinstance(value, Mapping):
+        yield key, plain(value)
+        return
+    for inner, one in value.items():
+        yield from _leaves(f"{key}.{inner}", one)
 
 
 def to_goals(what: str, goals: Sequence[str]) -> list["Override"]:

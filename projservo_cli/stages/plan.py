@@ -172,11 +172,13 @@ def _to_any_goal(scenario: Scenario) -> Plan:
     Raises WorkFailed where no joints meet all incidences, with those that fail, or no motion leads to a goal.
     """
     model, ends = scenario.model, scenario.ends
-    state, task, _, _ = _partitioned(model, ends, scenario.inputs.trajectory, scenario.demands.limits)
-    names, H_taught = tuple(one.name for one in ends.incidences), ends.displacement_taught(model)
-    apart = tuple(contradictions(task.incidences, names, task.body, H_taught, scenario.goal_error_px))
+    H_taught, shows = ends.displacement_taught(model), np.isfinite(ends.taught().s_star[..., 0])
+    asked, sigma_px = ends.incidences, scenario.goal_error_px
+    apart = tuple(contradictions(model, ends.body, H_taught, asked, shows, sigma_px))
     if not usable(apart):
         raise failed([one for one in apart if one.severity == REFUSES])
+    state, task, _, _ = _partitioned(model, ends, scenario.inputs.trajectory, scenario.demands.limits)
+    names = tuple(one.name for one in asked)
     body = body_at_start(model, task, ends, state.A)
     c = constraints_of(model, body, task, ends.q_start, scenario.demands)
     seed = scenario.inputs.trajectory.search.seed

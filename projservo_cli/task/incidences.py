@@ -435,6 +435,18 @@ def _stepped_to(incidences: Incidences, body: Body, H: FloatArray, moved: _Moved
     return H
 
 
+def each_in_pixels(
+    incidences: Incidences, model: Model, body: Body, H: FloatArray, shows: BoolArray
+) -> Incidences:
+    """Rows in px as of where each incidence is met by itself; arguments as of ``weighted``."""
+    moved, found = image_velocities(model, shows), []
+    for k in np.unique(incidences.rows[:, _GROUP]).tolist():
+        one = only(incidences, [k])
+        found.append(weighted(one, model, body, nearest_goal(one, body, H, moved), shows, np.zeros(4)))
+    rows = np.concatenate([one.rows[:, :_WEIGHT] for one in found])
+    return NO_INCIDENCES._replace(rows=rows, senses=np.concatenate([one.senses for one in found]))
+
+
 def only(incidences: Incidences, numbers: Sequence[int]) -> Incidences:
     """Return the rows and senses of some incidences, each row by itself."""
     rows = incidences.rows[np.isin(incidences.rows[:, _GROUP], numbers)]

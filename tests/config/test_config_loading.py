@@ -9,6 +9,7 @@ from projservo_cli.config.inputs import servo_inputs
 from projservo_cli.laws import LAW_SPECS, LAWS
 from projservo_cli.records import InputError
 from projservo_cli.result_hashes import encoded
+from projservo_cli.settings.task import Goal
 from tests.conftest import SHIPPED
 
 GOOD = """\
@@ -277,3 +278,11 @@ def test_a_value_that_may_be_of_several_kinds_is_refused_in_one_line(override, s
     with pytest.raises(InputError) as refused:
         load_config(shipped("paper"), [override])
     assert str(refused.value) == f"--set {override}: {says}"
+
+
+def test_a_key_with_dots_replaces_a_whole_section_and_mappings_merge():
+    config = load_config(SHIPPED / "insertion.yaml")
+    assert config.task.goal.incidences
+    assert config.replace({"task.goal": {"roll_deg": 30.0}}).task.goal == Goal(roll_deg=30.0)
+    merged = config.replace({"noise": {"servo_px": 0.5}})
+    assert merged.noise == config.noise.model_copy(update={"servo_px": 0.5})

@@ -8,6 +8,7 @@ from scipy.linalg import expm
 
 from projservo_cli.control import command, make_law
 from projservo_cli.control.law import OK, UNLIMITED, Gains, new_state
+from projservo_cli.findings import LIMITS, REFUSES
 from projservo_cli.geometry.algebra import as_array, mat
 from projservo_cli.laws import CODES
 from projservo_cli.records import (
@@ -20,6 +21,7 @@ from projservo_cli.records import (
     position_limits,
 )
 from projservo_cli.task.body import SETTLED, fit_body, make_body
+from projservo_cli.task.contradictions import contradictions
 from projservo_cli.task.face import MIDPOINT, center_of, cyclic_order, face_plane
 from projservo_cli.task.incidences import (
     Incidence,
@@ -227,6 +229,93 @@ def test_the_nearest_goal_has_its_features_in_their_sense(kind):
             goal = nearest_goal(case.rows, case.body, G @ H @ np.linalg.inv(G), moved)
             assert image_error_at(case.rows, goal) < 1e-4
             assert errors_px(case.rows, goal[None]).max() < 1e-4
+
+
+def contradicting(asked, seed, sigma_px, G=None):
+    """Contradictions of a list that is taught somewhere."""
+    rng = np.random.default_rng([31, seed])
+    model, M = random_arm(rng)
+    G = np.eye(4) if G is None else G
+    there = in_frame(model, G)
+    H = poe(there, model.q_reference + deviating(rng))
+    shows = np.ones((2, len(M)), dtype=bool)
+    return list(contradictions(there, make_body(there, M @ G.T), H, asked(M), shows, sigma_px))
+
+
+def apart(asked, seed=0, sigma_px=0.1, G=None):
+    """Their severity and the names of the incidences."""
+    found = contradicting(asked, seed, sigma_px, G)
+    return [(one.severity, tuple(other.subject.name for other in one.others)) for one in found]
+
+
+CONTRADICTORY = [
+    [Incidence("a", LINE, WALL[:2], ANGLE, 30.0), Incidence("b", LINE, WALL[:2], ANGLE, 60.0)],
+    [Incidence("a", PLANE, WALL, ANGLE, 20.0), Incidence("b", PLANE, WALL, ANGLE, 70.0)],
+    [Incidence("a", POINT, POINT), Incidence("b", POINT, ((5,),))],
+    [Incidence("a", LINE, LINE), Incidence("b", LINE, LINE[::-1], PARALLEL)],
+    [Incidence("a", LINE, LINE), Incidence("b", ((7,),), LINE)],
+]
+
+
+@pytest.mark.parametrize("pair", CONTRADICTORY)
+def test_incidences_that_no_place_meets_are_named(pair):
+    """The two of them, alone and among others that they agree with, in any frame."""
+    between = [pair[0], Incidence("other", ((6,),), PLANE), pair[1]]
+    for seed in range(3):
+        for asked in (pair, between):
+            assert apart(lambda _, asked=asked: asked, seed, G=frame(seed)) == [(REFUSES, ("a", "b"))]
+
+
+def test_a_list_that_holds_where_it_was_taught_agrees_however_many_rows_it_has():
+    def asked(M):
+        return [Incidence("wall", WALL, WALL), *whole_pose(M[:4])]
+
+    for seed in range(3):
+        assert apart(asked, seed, 1e-3, frame(seed)) == []
+
+
+def _angle(X, Y, tool, scene):
+    """Angle, deg, of features of metric points X (m, 3) and Y (m, 3)."""
+    axes = []
+    for points, flat in ((X, tool), (Y, scene)):
+        A = points[[one for (one,) in flat]]
+        axes.append(A[1] - A[0] if len(A) == 2 else np.cross(A[1] - A[0], A[2] - A[0]))
+    cosine = axes[0] @ axes[1] / np.prod(np.linalg.norm(axes, axis=1))
+    return math.degrees(math.acos(np.clip(cosine, -1.0, 1.0)))
+
+
+def test_angles_that_some_turn_has_together_agree():
+    """Of up to three pairs of lines or of planes, as a random turn of the tool makes them."""
+    for seed in range(40):
+        rng = np.random.default_rng([43, seed])
+        turn = displacement(3.0 * rng.normal(size=3), np.zeros(3))[:3, :3]
+        kinds = [(LINE, ACROSS, SLANT), (PLANE, WALL)]
+        alike = [kinds[k] for k in rng.integers(0, 2, 1 + seed % 3)]
+        pairs = [tuple(flats[k] for k in rng.integers(0, len(flats), 2)) for flats in alike]
+
+        def asked(M, pairs=pairs, turn=turn):
+            return [
+                Incidence(f"{k}", tool, scene, ANGLE, _angle(M[:, :3] @ turn.T, M[:, :3], tool, scene))
+                for k, (tool, scene) in enumerate(pairs)
+            ]
+
+        assert apart(asked, seed, 1e-3) == [], seed
+
+
+def test_a_contradiction_within_the_noise_is_told_or_none():
+    """Two angles that differ by 0.2° are as far apart as the images of the line that is turned by as much."""
+
+    def asked(M, by=0.2):
+        axes = [M[j, :3] - M[4, :3] for j in (5, 7)]
+        taught = math.degrees(math.acos(axes[0] @ axes[1] / np.prod(np.linalg.norm(axes, axis=1))))
+        return [Incidence("a", LINE, ACROSS, ANGLE, taught), Incidence("b", LINE, ACROSS, ANGLE, taught + by)]
+
+    (one,) = contradicting(asked, 0, 1e-3)
+    (twice,) = contradicting(lambda M: asked(M, 0.4), 0, 1e-3)
+    assert twice.amount == pytest.approx(2.0 * one.amount, rel=0.02)
+    for sigmas, severity in ((6.0, REFUSES), (4.0, LIMITS), (1.0, None)):
+        found = apart(asked, sigma_px=one.amount / sigmas)
+        assert found == ([] if severity is None else [(severity, ("a", "b"))])
 
 
 def test_distances_and_angles_are_those_of_the_metric():
