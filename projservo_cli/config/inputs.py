@@ -238,11 +238,10 @@ def _incidence(pair: Pair, features: Mapping[str, Feature]) -> Incidence:
     """Return a pair of features, as messages and figures write it, with the numbers of its markers."""
     relation = pair[2] if len(pair) == 3 else MEET
     tool, scene = (features[name].flat(features) for name in pair[:2])
-    between = {MEET: "on", PARALLEL: "parallel to", PERPENDICULAR: "perpendicular to"}
-    name = f"{pair[0]} {between.get(str(relation), f'at {relation} deg to')} {pair[1]}"
-    if isinstance(relation, str):
-        return Incidence(name, tool, scene, relation)
-    return Incidence(name, tool, scene, ANGLE, float(relation))
+    if not isinstance(relation, str):
+        return Incidence(f"{pair[0]} at {relation:g}° to {pair[1]}", tool, scene, ANGLE, float(relation))
+    between = {MEET: "on", PARALLEL: "parallel to", PERPENDICULAR: "perpendicular to"}[relation]
+    return Incidence(f"{pair[0]} {between} {pair[1]}", tool, scene, relation)
 
 
 def _displacement(config: Config) -> StandOff | None:

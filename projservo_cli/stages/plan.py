@@ -191,7 +191,7 @@ def _to_any_goal(scenario: Scenario) -> Plan:
             for px, name in each
             if px > min(_LEFT_PX, 0.5 * each[0][0])
         ]
-        raise failed([Finding("unmet_incidences", REFUSES, others=tuple(missed))])
+        raise failed([*apart, Finding("unmet_incidences", REFUSES, others=tuple(missed))])
     plans, failures = [], []
     for q in goals[:_GOALS]:
         H = forward_kinematics(model, q)

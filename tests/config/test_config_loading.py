@@ -281,7 +281,7 @@ def test_a_value_that_may_be_of_several_kinds_is_refused_in_one_line(override, s
 
 
 def test_a_key_with_dots_replaces_a_whole_section_and_mappings_merge():
-    config = load_config(SHIPPED / "insertion.yaml")
+    config = load_config(shipped("insertion"))
     assert config.task.goal.incidences
     assert config.replace({"task.goal": {"roll_deg": 30.0}}).task.goal == Goal(roll_deg=30.0)
     merged = config.replace({"noise": {"servo_px": 0.5}})

@@ -88,11 +88,13 @@ def test_features_of_tool_and_scene_are_drawn_where_they_are():
     assert np.nanmax(np.abs(last - motion.features)) < 2e-3
 
 
-def test_incidences_that_contradict_each_other_are_refused_with_what_is_left_of_them():
+def test_incidences_that_contradict_each_other_are_refused_by_their_names():
     config, calibration, _ = made()
     goal = config.task.goal.model_copy(update={"incidences": (("pin", "hole"), ("pin", "hole", 40.0))})
     config = config.model_copy(update={"task": config.task.model_copy(update={"goal": goal})})
-    with pytest.raises(WorkFailed, match=r"meet all incidences; the nearest leave .*pin at 40.0 deg to hole"):
+    with pytest.raises(
+        WorkFailed, match="pin on hole and pin at 40° to hole contradict each other: wherever"
+    ):
         plan.run(config, calibration)
 
 
