@@ -597,7 +597,7 @@ def _reason(run: LawRun, joint: int, remaining: tuple[float | None, float | None
     at_step = replace(own, amount=float(steps), unit="1")
     if verdict == "converged":
         yield replace(own, severity=NOTE, limit=within)
-        yield from (*_vague(run), *_apart(run))
+        yield from (*_vague(run), *_apart(run), *_unkept(run, at_step))
         return
     if verdict == "no progress":
         yield replace(own, others=(run.why or _stalled_by(run),))
@@ -651,6 +651,23 @@ def _apart(run: LawRun) -> Iterator[Finding]:
     seen, most = float(run.log.error[run.steps]), _BY_NOISE * by_noise
     if seen > most:
         yield Finding("face_apart", LIMITS, amount=seen, limit=most, unit="px")
+
+
+def _unkept(run: LawRun, at_step: Finding) -> Iterator[Finding]:
+    """Tell which constraint a simulated run did not keep in truth, so that it is no success."""
+    summary, hidden = run.summary, run.self_occluded_steps
+    if summary.success != 0.0:
+        return
+    found = replace(at_step, severity=LIMITS)
+    if summary.first_outside_image >= 0:
+        yield replace(found, code="out_of_view", amount=float(summary.first_outside_image))
+    if (step := summary.first_beyond_limit) >= 0:
+        q, limits = run.log.q[step], run.plant.limits
+        joint = int(np.argmax(np.maximum(limits.lower - q, q - limits.upper)))
+        yield replace(found, code="joint_passed", subject=Subject(joints=(joint + 1,)), amount=float(step))
+    for name, steps in zip(run.scenario.view, hidden, strict=True):
+        if steps:
+            yield replace(found, code="face_hidden", subject=Subject(views=(name,)), amount=float(steps))
 
 
 def _blind_view(s: FloatArray, names: Sequence[str], window: int) -> Sequence[Finding]:

@@ -73,6 +73,8 @@ REASONS = {
     "face_left": Row("the face is {amount} from the cameras, over {part} times the {limit} at first"),
     "not_finite": Row("the command at step {count} is not finite"),
     "out_of_view": Row("a face marker left an image at step {count}"),
+    "joint_passed": Row("{joints} passed its limit at step {count}"),
+    "face_hidden": Row("the {view} camera was behind the face at {count} steps"),
     "behind_camera": Row("a face marker passed behind a camera at step {count}"),
     "markers_lost": Row("the law could not measure the face at step {count}: {causes}"),
     "marker_unseen": Row("a marker was not seen{for_long}"),
