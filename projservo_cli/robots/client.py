@@ -289,9 +289,10 @@ class DrivenRobot:
 
     @property
     def carried_px(self) -> float:
-        """Return the distance of the face from its place of rest, px rms per marker and view."""
+        """Return the distance of the face from its place of rest, px rms per marker and view; NaN unseen."""
         face = self._carried[:, : len(self.plant.M)]
-        return math.sqrt(2.0 * float(np.nanmean(face**2)))
+        known = face[np.isfinite(face)]
+        return math.sqrt(2.0 * float(np.mean(known**2))) if known.size else math.nan
 
     def settled(self, within_px: float) -> bool:
         """Whether the arm stands, by images within a number of px rms or by its readings.
