@@ -1,6 +1,7 @@
 """Goals carried by objects: whether 95 % regions hold the truth, and how large errors are.
 
-    python -m tests.studies.carried_goals [--calibrations 17] [--arms NAME ...] [-o carried_goals.csv]
+    python -m tests.studies.carried_goals [--calibrations 17] [--arms NAME ...] [--faults NAME ...]
+                                          [-o carried_goals.csv]
 
 Each calibration of a simulated arm, from its own trial motions at 0.5 px, sees 24 objects of two tags, of 30
 and of 60 mm, 80 mm beside a goal of the tool. Each is displaced by up to 150 mm and 60°, and seen once before
@@ -33,6 +34,14 @@ SEED, NOISE_PX = 520_000, 0.5
 KINDS = ((0.06, False, 10), (0.03, False, 10), (0.06, True, 4))
 BESIDE, FARTHEST, MOST = 0.08, 0.15, np.radians(60.0)  # m, m, rad
 TILT = np.radians(40.0)  # of an object from the direction of the cameras, at most
+# What befell an object: the markers that moved, by so many m, or the one that one image shows off, px.
+FAULTS = {
+    "tag slipped by 2 mm": (range(4, 8), 0.002, 0.0),
+    "tag slipped by 5 mm": (range(4, 8), 0.005, 0.0),
+    "marker off by 3 mm": (range(5, 6), 0.003, 0.0),
+    "corner off by 6 px": (range(5, 6), 0.0, 6.0),
+}
+FAULTY = 12
 LEAST_COSINE = np.cos(np.radians(70.0))  # of the angle between the normal of a tag and a ray
 CORNERS = np.array([[-0.5, -0.5, 0.0], [0.5, -0.5, 0.0], [0.5, 0.5, 0.0], [-0.5, 0.5, 0.0]])
 # The second tag beside the first, in sides, and how it is turned, rad.
@@ -43,6 +52,7 @@ COLUMNS = (
     "object",
     "side_mm",
     "one_view",
+    "fault",
     "refused",
     "square",
     "mm",
@@ -125,8 +135,8 @@ def carried_pose(truth, s, tool):
     return fit.x, fit.jac
 
 
-def draw(arm, seed):
-    """Rows of all objects of a calibration."""
+def draw(arm, seed, faults=()):
+    """Rows of all objects of a calibration, sound ones or those that something befell."""
     config = configured(arm)
     truth, rng = truth_of(config), np.random.default_rng(seed)
     try:
@@ -143,11 +153,21 @@ def draw(arm, seed):
         return s + NOISE_PX * rng.standard_normal(s.shape)
 
     rows = []
-    for k, (side, one_view) in enumerate([(side, one) for side, one, count in KINDS for _ in range(count)]):
+    objects = [(side, one, "") for side, one, count in KINDS for _ in range(count)]
+    for k, (side, one_view, fault) in enumerate(
+        [(0.06, False, fault) for fault in faults for _ in range(FAULTY)] if faults else objects
+    ):
         X, tool, T = scene(truth, goals, side, rng)
         tool = tool[tool_of]
         row = {"arm": arm, "seed": seed, "object": k, "side_mm": 1e3 * side, "one_view": one_view}
-        taught, now, goal = images(X), images(X @ T.T), images(tool)
+        row["fault"], changed, off = fault, X.copy(), 0.0
+        if fault:
+            which, by, off = FAULTS[fault]
+            changed[which, :3] += by * direction(rng)
+        taught, now, goal = images(X), images(changed @ T.T), images(tool)
+        if off:
+            turn = rng.uniform(-np.pi, np.pi)
+            now[rng.integers(2), FAULTS[fault][0][0]] += off * np.array([np.cos(turn), np.sin(turn)])
         if one_view:
             now[rng.integers(2)] = np.nan
         rows.append(row)
@@ -175,11 +195,20 @@ def main():
         __doc__,
         [("calibrations", 17, "of each arm, with 24 objects each")],
         arms=(ARMS, list(ARMS)),
+        faults=(FAULTS, []),
     )
     given = parser.parse_args()
-    jobs = [(arm, SEED + k) for arm in given.arms for k in range(given.calibrations)]
+    jobs = [(arm, SEED + k, given.faults) for arm in given.arms for k in range(given.calibrations)]
     rows = written(given.output, COLUMNS, in_two_processes(drawn, jobs, "calibrations"))
-    for arm in given.arms:
+    for fault in given.faults:
+        own = [r for r in rows if r.get("fault") == fault]
+        refused = sum("refused" in r for r in own)
+        held = sum(r.get("square", np.inf) <= chi2.ppf(0.95, 6) for r in own)
+        mm = [r["mm"] for r in own if "mm" in r]
+        print(
+            f"{fault}: held or refused {rate(held + refused, len(own))} %, refused {refused}; {quantiles(mm)} mm"
+        )
+    for arm in () if given.faults else given.arms:
         for side, one_view, _ in KINDS:
             own = [
                 r
