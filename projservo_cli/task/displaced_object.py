@@ -46,11 +46,11 @@ _UNSEEN = 0.3
 _UNDECIDED = 13.8
 # Number of minima of a place for known points that the points are then freed from.
 _MINIMA = 3
-# Times the stated noise, and chance, beyond which residuals are not those of the same rigid object.
-_NOISE, _BY_CHANCE = 2.0, 1e-3
-# Of so many markers seen in a look, one that is off by itself may be left out; times the noise up to which
-# the others then lie as they did.
-_SHARE, _WITHOUT = 8, 1.5
+# Chance of residuals beyond which they are not those of the same rigid object, and error of a finder that all
+# frames of a look have alike, px: by rendered tags that lie as they did.
+_BY_CHANCE, _ALIKE_PX = 1e-4, 0.02
+# Of so many markers seen in a look, one that is off by itself may be left out.
+_SHARE = 8
 # Cosine of the angle between the axis of a turn and a line of markers, above which it is about that line.
 _ALONG = 0.95
 
@@ -189,26 +189,28 @@ class _Search:
         return Finding("object_turned", REFUSES, shown, at_most, limit=_UNSEEN, unit="rad", others=about)
 
 
-def _elsewhere(rig: LookRig, fit: BundleFit, most: float) -> tuple[float, int, int] | None:
-    """Residuals of markers that do not lie as they did, beyond ``most`` times noise and calibration.
+def _elsewhere(rig: LookRig, fit: BundleFit) -> tuple[float, float, int, int] | None:
+    """Residuals of markers that do not lie as they did, beyond chance by noise and calibration.
 
-    Returns how many times the noise they are, with look and marker that are off most; None if they do.
+    Returns how many times the noise they are, and at most by chance, with look and marker that are off most;
+    None if they do.
     """
     r, J = fit.linearized()
     dof = len(r) - J.shape[1]
     if dof < 1:
         return None
-    moved = fit.moved(rig, fit.X)
-    left = moved - J @ np.linalg.lstsq(J, moved)[0]
-    along = left.T @ r
+    share = 1.0 / np.hypot(1.0, _ALIKE_PX * np.repeat(fit.bundle.weight[fit.bundle.weight > 0.0], 2))
+    J, seen = share[:, None] * J, np.column_stack([share * r, share[:, None] * fit.moved(rig, fit.X)])
+    r, left = np.split(seen - J @ np.linalg.lstsq(J, seen)[0], [1], axis=1)
+    r, along = r[:, 0], left.T @ r[:, 0]
     square = r @ r - along @ np.linalg.solve(np.eye(left.shape[1]) + left.T @ left, along)
-    if square <= most**2 * chdtri(dof, _BY_CHANCE):
+    if square <= (most := chdtri(dof, _BY_CHANCE)):
         return None
     off = np.zeros(fit.bundle.weight.shape)
     off[fit.bundle.weight > 0.0] = (r.reshape(-1, 2) ** 2).sum(axis=1)
     at_look = off.sum(axis=1)
     look, k = np.unravel_index(int(np.argmax(at_look)), at_look.shape)
-    return float(np.sqrt(square / dof)), int(look), int(k)
+    return float(np.sqrt(square / dof)), float(np.sqrt(most / dof)), int(look), int(k)
 
 
 def _of_one_object(
@@ -222,11 +224,10 @@ def _of_one_object(
     looks, left_out = list(looks), list[int]()
     while True:
         fit, found_in, known = _Search(rig, marker, looks).found()
-        most = _WITHOUT if left_out else _NOISE
-        off = _elsewhere(rig, fit, most)
+        off = _elsewhere(rig, fit)
         if off is None:
             return fit, known, tuple(left_out)
-        times, look, k = off[0], found_in[off[1]], int(np.flatnonzero(known)[off[2]])
+        (times, most), look, k = off[:2], found_in[off[2]], int(np.flatnonzero(known)[off[3]])
         seen = np.isfinite(looks[look].s).all(axis=-1).any(axis=0)
         if (1 + len(left_out)) * _SHARE > seen.sum():
             of = Subject(markers=(int(marker[k]),))
