@@ -205,9 +205,8 @@ def main():
         refused = sum("refused" in r for r in own)
         held = sum(r.get("square", np.inf) <= chi2.ppf(0.95, 6) for r in own)
         mm = [r["mm"] for r in own if "mm" in r]
-        print(
-            f"{fault}: held or refused {rate(held + refused, len(own))} %, refused {refused}; {quantiles(mm)} mm"
-        )
+        good = rate(held + refused, len(own))
+        print(f"{fault}: held or refused {good} %, refused {refused}; {quantiles(mm)} mm", flush=True)
     for arm in () if given.faults else given.arms:
         for side, one_view, _ in KINDS:
             own = [
