@@ -226,17 +226,22 @@ def disturbed(folder, k):
     return {"kind": kind, "code": code, "mm": off, "verdict": named, "good": off < 3.0 if code == 0 else True}
 
 
+def taught(folder):
+    """Calibrate, and teach the goal on the part where it lies."""
+    calls = [["calibrate", "-c", str(CONFIG), "-o", str(folder / "run"), "-q"]]
+    goal = ["--set", "task.goal={taught: goal.yaml, on: part}", "-o", str(folder / "goal.yaml"), "-q"]
+    calls.append(["teach", str(folder / "run"), "-c", str(CONFIG), "--set", PLANT, *goal])
+    for name, value in AS_TAUGHT.items():
+        setattr(Seeing, name, value)
+    for call in calls:
+        assert cli.run(call) == 0
+
+
 def faults(count):
     """Rows of disturbed runs."""
     with TemporaryDirectory() as name:
         folder = Path(name)
-        calls = [["calibrate", "-c", str(CONFIG), "-o", str(folder / "run"), "-q"]]
-        goal = ["--set", "task.goal={taught: goal.yaml, on: part}", "-o", str(folder / "goal.yaml"), "-q"]
-        calls.append(["teach", str(folder / "run"), "-c", str(CONFIG), "--set", PLANT, *goal])
-        for name, value in AS_TAUGHT.items():
-            setattr(Seeing, name, value)
-        for call in calls:
-            assert cli.run(call) == 0
+        taught(folder)
         for k in range(count):
             yield disturbed(folder, k)
 
