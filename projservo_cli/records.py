@@ -790,6 +790,9 @@ class CarriedByObject:
     s_object: FloatArray | None = _optional_array(
         "view object_marker xy", "px", "images of these when it was planned, NaN if unseen"
     )
+    sigma_object: FloatArray | None = _optional_array(
+        "view object_marker", "px", "standard deviation of a coordinate of these, NaN if unknown"
+    )
     s_carried: FloatArray | None = _optional_array(
         "view observed xy", "px", "images of all markers of the body at the carried goal"
     )

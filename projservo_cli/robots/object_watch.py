@@ -5,6 +5,7 @@ from collections import deque
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.special import chdtri
 
 from projservo_cli.findings import REFUSES, Finding, Subject
 from projservo_cli.monitoring.innovation_tests import WINDOW
@@ -18,6 +19,9 @@ LOOKS = 20  # after which one view is enough: a camera that was moved has been n
 # as far aside by another light, or by what hides a part of a tag.
 _DEVIATIONS, _LEAST_PX = 4.0, 0.5
 _LEAST_MARKERS = 2  # seen in a view in all these frames
+# Chance by which an object that stands still has moved, and of what is left by one that did; its least
+# motion, rms px; and error of a finder that all frames have alike, px.
+_BY_CHANCE, _UNLIKE, _LEAST_MOTION_PX, _ALIKE_PX = 1e-6, 1e-4, 0.25, 0.02
 
 
 class ObjectWatch:
@@ -27,12 +31,22 @@ class ObjectWatch:
 
     name : of the object; marker : (k,) numbers of its markers, at these places (k,) among those of objects.
     s : (V, k, 2) px of them when the motion was planned, NaN where unseen.
+    sigma : (V, k) their deviation, NaN where it is that of a frame.
+    by_motion : (V, k, 2, g) derivatives of them by displacements of the object.
     ``moved``: that it has, and by how much; None where it has not.
     """
 
-    def __init__(self, name: str, marker: Sequence[int], places: IntArray, s: FloatArray) -> None:
+    def __init__(
+        self,
+        name: str,
+        marker: Sequence[int],
+        places: IntArray,
+        s: FloatArray,
+        sigma: FloatArray,
+        by_motion: FloatArray,
+    ) -> None:
         self.name, self._marker, self._places = name, marker, places
-        self._planned, self._looks = s, 0
+        self._planned, self._sigma, self._by_motion, self._looks = s, sigma, by_motion, 0
         self.moved: Finding | None = None
         self._frames: list[deque[FloatArray]] = [deque(maxlen=_FRAMES) for _ in s]
 
@@ -43,23 +57,53 @@ class ObjectWatch:
 
     def observe(self, reading: Reading) -> None:
         """Compare a reading with where the object was."""
-        off = list[bool]()
+        off, shown = list[bool](), list[int]()
+        away, scatter = np.full(self._planned.shape, np.nan), np.zeros(len(self._planned))
         found: Finding | None = None
         for view, frames in enumerate(self._frames):
             seen_now = reading.s_objects[view, self._places]
             if not frames or not np.array_equal(seen_now, frames[-1], equal_nan=True):  # else the same frame
                 frames.append(seen_now)
-            away = np.linalg.norm(np.mean(frames, axis=0) - self._planned[view], axis=1)
-            seen = np.isfinite(away)
+            by = np.mean(frames, axis=0) - self._planned[view]
+            seen = np.isfinite(by[:, 0])
             if len(frames) < _FRAMES or seen.sum() < _LEAST_MARKERS:
                 continue
             # By the scatter of the frames, with that of the plan, which may be of one.
             sigma = math.sqrt(float(np.var(np.array(frames)[:, seen], axis=0, ddof=1).mean()))
+            away[view], scatter[view] = by, sigma
+            shown.append(view)
             most = max(_LEAST_PX, _DEVIATIONS * sigma * math.sqrt(1.0 + 1.0 / _FRAMES))
-            off.append(bool((px := float(np.median(away[seen]))) > most))
+            off.append(bool((px := float(np.median(np.linalg.norm(by[seen], axis=1)))) > most))
             if off[-1]:
                 of = Subject(views=(reading.view[view],), markers=tuple(self._marker), name=self.name)
                 found = Finding("moved_object", REFUSES, of, px, limit=most, unit="px")
+        if (px := self._displaced_px(away, scatter)) > _LEAST_MOTION_PX:
+            of = Subject(
+                views=tuple(reading.view[v] for v in shown), markers=tuple(self._marker), name=self.name
+            )
+            self.moved = self.moved or Finding(
+                "moved_object", REFUSES, of, px, limit=_LEAST_MOTION_PX, unit="px"
+            )
         self._looks = self._looks + 1 if any(off) else 0
         if off and (all(off) or self._looks >= LOOKS):
             self.moved = self.moved or found
+
+    def _displaced_px(self, away: FloatArray, scatter: FloatArray) -> float:
+        """Motion of the images, rms px, by the displacement that explains how far they are away (V, k, 2).
+
+        Zero within chance, and where a displacement leaves more than chance, as of light, of what hides a
+        part, or of one camera that moved. scatter : (V,) deviation of a frame, px.
+        """
+        seen = np.isfinite(away[..., 0]) & np.isfinite(self._by_motion[..., 0, 0])
+        of_plan = np.where(np.isfinite(self._sigma), self._sigma, scatter[:, None])
+        sigma = np.sqrt(scatter[:, None] ** 2 / _FRAMES + of_plan**2 + _ALIKE_PX**2)
+        A = self._by_motion[seen].reshape(-1, self._by_motion.shape[-1])
+        weight = np.repeat(1.0 / sigma[seen], 2)
+        r, free = weight * away[seen].ravel(), len(weight) - A.shape[1]
+        if free < 1:
+            return 0.0
+        motion = np.linalg.lstsq(weight[:, None] * A, r)[0]
+        left = float(np.square(r - weight * (A @ motion)).sum())
+        if r @ r - left <= chdtri(A.shape[1], _BY_CHANCE) or left > chdtri(free, _UNLIKE):
+            return 0.0
+        return float(np.sqrt(np.square(A @ motion).sum() / seen.sum()))

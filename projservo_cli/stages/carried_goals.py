@@ -86,6 +86,7 @@ def carried_goal(
         "object_marker": np.array(carrier.numbers, dtype=np.int64),
         "object_left_out": ", ".join(map(str, found.left_out)) or None,
         "s_object": now.s,
+        "sigma_object": now.sigma,
         "s_carried": np.ascontiguousarray(goal.s[:, c.indices_of(scenario.numbers)]),
     }
     for unit in ("mm", "px"):

@@ -31,6 +31,7 @@ from projservo_cli.simulation.faults import FaultyRobot, Points, SimulatedRobot,
 from projservo_cli.simulation.streams import SERVO_NOISE
 from projservo_cli.stages.scenario import RunScenario
 from projservo_cli.stages.stage_inputs import Contract, Drive, OwnRobot
+from projservo_cli.task.displaced_object import images_by_motion
 
 _NEVER_LATE_S = 3600.0  # for a simulated robot, whose code may be compiled first
 # Minimum deviation of a delay and of single frames, s; width of a 95 % interval in deviations.
@@ -261,7 +262,9 @@ def connected_robot(
         name, numbers = plan.object_name or "", plan.object_marker.tolist()
         places = np.array([driven.further.index(number) for number in numbers])
         if name not in session.held.values():  # else it moves with the tool
-            watch = ObjectWatch(name, numbers, places, plan.s_object)
+            sigma, by_motion = plan.sigma_object, images_by_motion(calibration, plan.s_object)
+            sigma = np.full(plan.s_object.shape[:2], np.nan) if sigma is None else sigma
+            watch = ObjectWatch(name, numbers, places, plan.s_object, sigma, by_motion)
     session.at = watch if scenario.inputs.displaced is None else None
     return DrivenRobot(steered, plant, _known_of(scenario, contract, calibration, law), monitor, watch)
 

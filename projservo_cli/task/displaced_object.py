@@ -238,6 +238,23 @@ def _of_one_object(
         looks[look] = looks[look]._replace(s=s)
 
 
+def images_by_motion(c: Calibration, s: FloatArray) -> FloatArray:
+    """Derivatives (V, k, 2, g) of the images (V, k, 2) of an object by displacements of it, px.
+
+    NaN for markers that fewer than two views show. Raises WorkFailed as ``LookRig.of``.
+    """
+    rig, every = LookRig.of(c), np.arange(s.shape[1])
+    search = _Search(rig, every.tolist(), [Look(s, np.ones(s.shape[:2]))])
+    X = search.points(0, np.eye(4))
+    known = np.isfinite(X[:, 0])
+    found = np.full((*s.shape, len(rig.linear) + 3), np.nan)
+    if known.any():
+        bundle, at = search.bundle([0], known, X), np.eye(4)[None, None]
+        by_point = bundle.residuals(X[known][None], at)[1]
+        found[:, known] = bundle.by_motion(by_point, X[known][None], at)[0, 0]
+    return found
+
+
 @dataclass(frozen=True, eq=False)
 class _CarriedGoal:
     """Goal of the tool after the displacement of the object that it was taught on, with its errors."""

@@ -121,8 +121,8 @@ REASONS = {
         "the tool is pressed with {amount}, beyond the {limit} of stop.max_force_n", "see what it touches"
     ),
     "moved_object": Row(
-        "the object {name}, markers {ends}, has moved since the motion was planned, by {amount} in the "
-        "{view} image ({limit} at most)",
+        "the object {name}, markers {ends}, has moved since the motion was planned, by {amount} in "
+        "{the_images} ({limit} at most)",
         "let it lie still, and plan again",
     ),
     "unseen_markers": Row("{dark} of the calibration"),

@@ -465,6 +465,11 @@ VALUES: dict[str, Callable[[Told], object]] = {
     "corners": lambda told: "" if math.isnan(told.one.amount) else f"; corners to {told.one.amount:.2g} px",
     "share": lambda told: _by_views(told, "shows", "share", "two or more show"),
     "lack": lambda told: _by_views(told, "does not show", "do not both show", "fewer than two show"),
+    "the_images": lambda told: (
+        f"the {told.subject.views[0]} image"
+        if len(told.subject.views) == 1
+        else f"the images of {joined(told.subject.views)}"
+    ),
     "images": lambda told: _by_views(told, "image", "both images", "images"),
     "towards": lambda told: all_of(told.setup.view),
     "sharing": lambda told: sharing(told.setup.view),

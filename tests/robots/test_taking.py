@@ -11,6 +11,7 @@ from projservo_cli.robots.object_watch import ObjectWatch
 from projservo_cli.robots.session import Session
 
 AT = 100.0 + 10.0 * np.arange(16.0).reshape(2, 4, 2)  # px, of four markers in two views
+UNKNOWN = np.full((2, 4), np.nan), np.full((2, 4, 2, 6), np.nan)  # their deviations, and how they move
 
 
 class Gripping(Session):
@@ -32,7 +33,7 @@ class Gripping(Session):
         return Reading(np.zeros(1), s[:, :0], 0.0, np.full(2, np.nan), None, s_objects=s)
 
     def arrive(self):
-        self.at = ObjectWatch("part", range(40, 44), np.arange(4), AT)
+        self.at = ObjectWatch("part", range(40, 44), np.arange(4), AT, *UNKNOWN)
 
 
 def test_what_was_taken_belongs_to_the_tool_until_the_next_action_of_that_name():
