@@ -18,7 +18,7 @@ from projservo_cli.planning.margins import limits_alone
 from projservo_cli.planning.rrt_connect import SearchLimits, find_path
 from projservo_cli.simulation.random_tasks import random_tasks
 from projservo_cli.task.target import TaskImages
-from tests.configured import joints_of, truth_of
+from tests.configured import calibrate, joints_of, truth_of
 from tests.known import configured, with_task
 
 # Configurations with images of 0.5 px noise, each with a seed of its own for its tasks.
@@ -35,6 +35,14 @@ def task_configs(name, count, *overrides):
     tasks = random_tasks(truth_of(config), front, count, np.random.default_rng(SEEDS[name]))
     for k, ends in enumerate(zip(*tasks, strict=True)):
         yield with_task(config, ends, seed=k)
+
+
+def jobs_of(arms, count, *more):
+    """Jobs of random tasks of each arm: its name, seed, configuration and one calibration, and more."""
+    for arm in arms:
+        configs = list(task_configs(arm, count))
+        calibration = calibrate.run(configs[0])[1]
+        yield from ((arm, k, config, calibration, *more) for k, config in enumerate(configs))
 
 
 def tasks_in(path, **only):

@@ -12,8 +12,8 @@ import numpy as np
 
 from projservo_cli.records import WorkFailed
 from projservo_cli.settings.features import Feature
-from tests.configured import calibrate, plan, servo
-from tests.studies.common import in_two_processes, parser_of, quantiles, rate, task_configs, write_rows
+from tests.configured import plan, servo
+from tests.studies.common import in_two_processes, jobs_of, parser_of, quantiles, rate, write_rows
 
 ARMS = ["paper", "ur5"]
 SHOWN = {
@@ -95,11 +95,7 @@ def main():
     """Drive all tasks and print rates of plans and of successes, and errors from the nearest goal."""
     numbers = [("tasks", 500, "of each kind and arm")]
     given = parser_of("incidences_study", __doc__, numbers, arms=ARMS, kinds=KINDS).parse_args()
-    jobs = []
-    for arm in given.arms:
-        configs = list(task_configs(arm, given.tasks))
-        calibration = calibrate.run(configs[0])[1]
-        jobs += [(arm, k, config, calibration, given.kinds) for k, config in enumerate(configs)]
+    jobs = list(jobs_of(given.arms, given.tasks, given.kinds))
     rows = []
     for mine in in_two_processes(driven, jobs, "tasks"):
         rows += mine

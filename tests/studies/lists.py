@@ -12,8 +12,8 @@ import numpy as np
 
 from projservo_cli.records import WorkFailed
 from projservo_cli.settings.features import Feature
-from tests.configured import calibrate, plan
-from tests.studies.common import in_two_processes, parser_of, rate, task_configs, write_rows
+from tests.configured import plan
+from tests.studies.common import in_two_processes, jobs_of, parser_of, rate, write_rows
 
 # Markers of a point, of another one, of a line through the first, and of a plane off it.
 MARKERS = {"ur5": (8, 9, 4, (5, 7, 9)), "hobby": (4, 5, 6, (5, 6, 7))}
@@ -82,11 +82,7 @@ def main():
     """Plan all tasks and print how many were refused, and as what."""
     numbers = [("tasks", 300, "of each kind and arm")]
     given = parser_of("lists_study", __doc__, numbers, arms=[*MARKERS], kinds=KINDS).parse_args()
-    jobs = []
-    for arm in given.arms:
-        configs = list(task_configs(arm, given.tasks))
-        calibration = calibrate.run(configs[0])[1]
-        jobs += [(arm, k, config, calibration, given.kinds) for k, config in enumerate(configs)]
+    jobs = list(jobs_of(given.arms, given.tasks, given.kinds))
     rows = []
     for mine in in_two_processes(planned, jobs, "tasks"):
         rows += mine
