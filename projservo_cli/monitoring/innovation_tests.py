@@ -34,6 +34,8 @@ _LASTING = np.sqrt(2.0)
 # The χ² of the errors that corners keep in one view is taken at this chance, for those that a fault touches:
 # two deviations rms for one corner, 1.3 for a camera.
 _LASTING_CORNERS = 3e-3
+# Size of a direction over the largest, below which it is round-off.
+_DEPENDENT = 1e-9
 # Differences between successive frames: of one view in motion, of one view at rest, and of two views.
 _IN_MOTION, _AT_REST, _BETWEEN_VIEWS = range(3)
 # A corner errs as detections of the calibration from within about this angle, rad; this number of typical
@@ -417,7 +419,10 @@ class _Memory:
         off, moved = (now.r - before.r) * weight[:, 0], now.F[:, columns] * weight
         if kind == _BETWEEN_VIEWS:
             moved = np.concatenate([moved, before.F[:, columns] * weight], axis=1)
-        basis, R = np.linalg.qr(moved[rows])
+        # All instants together are a motion of the joints: what depends on others is no direction of its own.
+        basis, sizes, turned = np.linalg.svd(moved[rows], full_matrices=False)
+        independent = sizes > _DEPENDENT * sizes.max(initial=0.0)
+        basis, back = basis[:, independent], turned[independent].T / sizes[independent]
         along = basis.T @ off[rows]
         freedom = len(basis) - basis.shape[1]
         if freedom <= 0:
@@ -428,7 +433,7 @@ class _Memory:
             by_errors = ((now.B - before.B) * weight)[rows]
             square = max(0.0, square - float(np.square(by_errors - basis @ (basis.T @ by_errors)).sum()))
         elif kind == _AT_REST:
-            off -= moved @ np.linalg.lstsq(R, along)[0]
+            off -= moved @ (back @ along)
             step = 0.5 * np.square(off / weight[:, 0]).reshape(*in_both.shape, 2).sum(axis=2)
             self._steps.append(np.where(in_both, step, np.nan))
         # Fading, so that the errors of a finder in one light do not count for ever.

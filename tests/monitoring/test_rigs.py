@@ -237,8 +237,7 @@ def test_the_order_of_the_views_does_not_matter(case):
     assert (one, count) == (other, other_count)
     np.testing.assert_array_equal(aside, other_aside)
     assert aside.any()
-    # Time begins with the first view that is listed; rounding of a calibration alone changes it by 1 to 2 %.
-    assert square == pytest.approx(other_square, rel=0.05)
+    assert square == pytest.approx(other_square, rel=1e-6)
 
 
 def test_residuals_of_the_model_itself_are_no_fault_more_often_than_stated(case, monkeypatch):
