@@ -17,7 +17,7 @@ from scipy.special import ndtr
 
 from projservo_cli import words
 from projservo_cli.findings import REFUSES, Finding, Subject
-from projservo_cli.geometry.least_squares import Equations, minimize
+from projservo_cli.geometry.least_squares import Equations, levenberg_marquardt
 from projservo_cli.image_size import natural
 from projservo_cli.records import (
     CORNERS,
@@ -314,7 +314,7 @@ def _fitted(x: FloatArray, strips: _Strips, noise: FloatArray, steps: int) -> tu
         cost = (r * r).sum(axis=(1, 2)) + (stiff * x * x).sum(axis=1)
         return Equations(A, (J @ r.reshape(len(r), -1, 1))[..., 0] + stiff * x, cost)
 
-    (x,), there = minimize((x,), equations, partial(_blurred, _MIN_BLUR), steps)
+    (x,), there = levenberg_marquardt((x,), equations, partial(_blurred, _MIN_BLUR), steps)
     return x, there.A
 
 
@@ -893,7 +893,7 @@ def _refine_saddles(
         there = Equations.of(r, J.swapaxes(1, 2))
         return there._replace(A=there.A + 1e-9 * np.eye(_SADDLE))
 
-    (x,), there = minimize((x,), equations, partial(_blurred, _MIN_BLUR_SADDLE), _SADDLE_STEPS)
+    (x,), there = levenberg_marquardt((x,), equations, partial(_blurred, _MIN_BLUR_SADDLE), _SADDLE_STEPS)
     residual = _saddle_model(x, u, v, grey, weight)[0]
     square = (residual**2).sum(axis=1) / np.maximum(count - _SADDLE, 1.0)
     # Neighbours differ by noise alone: the rest of the residual is of something before the corner.

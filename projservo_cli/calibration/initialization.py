@@ -16,7 +16,7 @@ from projservo_cli.calibration.epipolar import ImageFrame, ImageGeometry, log_di
 from projservo_cli.calibration.prediction import Parameters
 from projservo_cli.geometry.displacements import aligned, cross_matrix
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
-from projservo_cli.geometry.least_squares import Equations, minimize
+from projservo_cli.geometry.least_squares import Equations, levenberg_marquardt
 from projservo_cli.records import (
     BoolArray,
     FloatArray,
@@ -270,7 +270,7 @@ def _fit_axes(
         turn = _rotations(step.reshape(S, n + 1, 3))
         return np.einsum("snij,snj->sni", turn[:, :n], w), turn[:, n] @ base
 
-    (w, _), there = minimize((w, base), equations, turned, _TURNS)
+    (w, _), there = levenberg_marquardt((w, base), equations, turned, _TURNS)
     return w, there.cost
 
 

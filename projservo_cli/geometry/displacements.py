@@ -8,6 +8,7 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from projservo_cli.geometry.algebra import IDENTITY, Mat4, as_array, combine, mat, mul
@@ -18,6 +19,8 @@ from projservo_cli.records import BoolArray, FloatArray, WorkFailed
 _NOWHERE = np.eye(4)
 # Change of a quadratic form by the joints, over the largest, below which it is invariant.
 _INVARIANT = 1e-6
+# Rotation vectors (24, 3) of the symmetries of a cube.
+_TURNS = Rotation.create_group("O").as_rotvec()
 # Orthonormal basis (6, 3, 3) of symmetric forms, by the rows and columns of their entries.
 _ROWS, _COLUMNS = np.triu_indices(3)
 _SYMMETRIC = np.zeros((6, 3, 3))
@@ -156,6 +159,11 @@ def generators(linear: FloatArray, center: FloatArray) -> FloatArray:
     E[range(3), range(3), 3] = 1.0
     E[3:, :3, :3], E[3:, :3, 3] = linear, -linear @ center
     return E
+
+
+def to_all_sides(H_hat: FloatArray) -> FloatArray:
+    """Displacements (24, 4, 4) by rotations (3, 4, 4), per rad, to all sides: no turn is 63° from each."""
+    return np.asarray(expm(np.einsum("bi,ijk->bjk", _TURNS, H_hat)))
 
 
 def twists(axes: FloatArray) -> FloatArray:

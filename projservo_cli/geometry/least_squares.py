@@ -29,19 +29,19 @@ class Equations(NamedTuple):
 
     @classmethod
     def of(cls, r: FloatArray, J: FloatArray) -> Self:
-        """Equations of residuals r (S, N) with derivatives J (S, N, p)."""
+        """Return the equations of residuals r (S, N) with derivatives J (S, N, p)."""
         J_T = J.swapaxes(1, 2)
         return cls(J_T @ J, (J_T @ r[..., None])[..., 0], np.square(r).sum(axis=1))
 
 
-def minimize(
+def levenberg_marquardt(
     x: tuple[FloatArray, ...],
     equations: Callable[..., Equations],
     moved: Callable[..., tuple[FloatArray, ...]],
     steps: int,
     enough: float = _EXACT,
 ) -> tuple[tuple[FloatArray, ...], Equations]:
-    """Minima beside some states, and their equations, by Levenberg–Marquardt steps with a damping of each.
+    """Minima beside some states, and their equations; each state has a damping of its own.
 
     x : arrays (S, …) that make up the states.
     equations : of such arrays.

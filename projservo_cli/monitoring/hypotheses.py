@@ -10,7 +10,7 @@ from scipy.linalg import cho_factor, cho_solve, expm
 
 from projservo_cli.calibration.prediction import Parameters, from_reference, in_chain_order
 from projservo_cli.deviations import CHANGES, Deviation
-from projservo_cli.geometry.least_squares import Equations, minimize
+from projservo_cli.geometry.least_squares import Equations, levenberg_marquardt
 from projservo_cli.image_size import FACTORS
 from projservo_cli.monitoring.frame_pairs import FramePair
 from projservo_cli.monitoring.innovation_tests import ErrorModel, Residual, Sums
@@ -257,15 +257,14 @@ class Evidence:
         """Fit of a cause, with the prior of its parameters."""
         cost = 0.0
         if theta.size:
-            (ends,), _ = minimize(
+            (ends,), _ = levenberg_marquardt(
                 (theta[None],),
                 lambda thetas: self._linearized(cause, thetas[0])[0],
                 lambda step, thetas: (thetas + step,),
                 _STEPS,
                 enough=_FALLS,
             )
-            theta = ends[0]
-            cost = self._linearized(cause, theta)[1]
+            theta, cost = ends[0], self._linearized(cause, ends[0])[1]
         here = self._changed_by(cause, theta)
         square = self._square(self._whitened(here))
         shift = self.at_first - here

@@ -18,7 +18,7 @@ from projservo_cli.task.incidences import Incidences, image_error_at, linearized
 _AROUND, _ANYWHERE, _SPREAD = 24, 24, 0.5
 # Newton steps, the longest of a joint, rad or m, and the image error, px, at which they hold exactly.
 _STEPS, _STRIDE, _MET_PX = 40, 0.4, 1e-6
-# What noise may leave over the least, of goals that are met as well.
+# Error over the least, up to which goals that are not exact are met as well.
 _AS_WELL = 1.01
 # Margin over that asked for, from which more of it counts no more.
 _AMPLE = 10.0

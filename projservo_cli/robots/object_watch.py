@@ -11,6 +11,7 @@ from projservo_cli.findings import REFUSES, Finding, Subject
 from projservo_cli.monitoring.innovation_tests import WINDOW
 from projservo_cli.records import FloatArray, IntArray
 from projservo_cli.robots.contract import Reading
+from projservo_cli.task.displaced_object import ALIKE_PX
 
 # Frames of a view in a row that show an object elsewhere: as many as are seen before the first motion.
 _FRAMES = WINDOW
@@ -20,8 +21,8 @@ LOOKS = 20  # after which one view is enough: a camera that was moved has been n
 _DEVIATIONS, _LEAST_PX = 4.0, 0.5
 _LEAST_MARKERS = 2  # seen in a view in all these frames
 # Chance by which an object that stands still has moved, and of what is left by one that did; its least
-# motion, rms px; and error of a finder that all frames have alike, px.
-_BY_CHANCE, _UNLIKE, _LEAST_MOTION_PX, _ALIKE_PX = 1e-6, 1e-4, 0.25, 0.02
+# motion, rms px.
+_BY_CHANCE, _UNLIKE, _LEAST_MOTION_PX = 1e-6, 1e-4, 0.25
 
 
 class ObjectWatch:
@@ -96,7 +97,7 @@ class ObjectWatch:
         """
         seen = np.isfinite(away[..., 0]) & np.isfinite(self._by_motion[..., 0, 0])
         of_plan = np.where(np.isfinite(self._sigma), self._sigma, scatter[:, None])
-        sigma = np.sqrt(scatter[:, None] ** 2 / _FRAMES + of_plan**2 + _ALIKE_PX**2)
+        sigma = np.sqrt(scatter[:, None] ** 2 / _FRAMES + of_plan**2 + ALIKE_PX**2)
         A = self._by_motion[seen].reshape(-1, self._by_motion.shape[-1])
         weight = np.repeat(1.0 / sigma[seen], 2)
         r, free = weight * away[seen].ravel(), len(weight) - A.shape[1]

@@ -15,7 +15,6 @@ from projservo_cli.task.incidences import (
     each_in_pixels,
     incidences_of,
     least_errors,
-    only,
     turned_about,
 )
 
@@ -39,18 +38,14 @@ def contradictions(
     numbers, sigma_px = range(len(asked)), max(sigma_px, _NEGLIGIBLE_PX)
     if (apart := _apart(each, body, H, numbers)) <= _TOLD * sigma_px:
         return
-    pairs = [(_apart(each, body, H, pair), pair) for pair in combinations(numbers, 2)]
-    found: list[tuple[float, Sequence[int]]] = [(px, pair) for px, pair in pairs if px > _TOLD * sigma_px]
-    for px, some in found or [(apart, numbers)]:
-        refuses = max(px, apart) > _APART * sigma_px
-        yield Finding(
-            "contradictory_incidences",
-            REFUSES if refuses else LIMITS,
-            amount=px,
-            limit=(_APART if refuses else _TOLD) * sigma_px,
-            unit="px",
-            others=tuple(Finding("incidence_name", subject=Subject(name=asked[k].name)) for k in some),
-        )
+    refuses = apart > _APART * sigma_px
+    most = (_APART if refuses else _TOLD) * sigma_px
+    pairs = combinations(numbers, 2) if len(asked) > 2 else ()
+    found: list[tuple[float, Sequence[int]]] = [(_apart(each, body, H, pair), pair) for pair in pairs]
+    for px, some in [one for one in found if one[0] > most] or [(apart, numbers)]:
+        names = tuple(Finding("incidence_name", subject=Subject(name=asked[k].name)) for k in some)
+        severity = REFUSES if refuses else LIMITS
+        yield Finding("contradictory_incidences", severity, amount=px, limit=most, unit="px", others=names)
 
 
 def _apart(incidences: Incidences, body: Body, H: FloatArray, numbers: Sequence[int]) -> float:
@@ -58,7 +53,7 @@ def _apart(incidences: Incidences, body: Body, H: FloatArray, numbers: Sequence[
 
     H : (4, 4) displacement beside which a better one is sought first; then to all sides.
     """
-    rows = only(incidences, numbers)
+    rows = incidences.of(numbers)
     _, squares = least_errors(rows, body, H[None])
     if math.sqrt(2.0 * squares[0]) > _NEGLIGIBLE_PX:
         squares = least_errors(rows, body, turned_about(body, H))[1]

@@ -48,7 +48,7 @@ _UNDECIDED = 13.8
 _MINIMA = 3
 # Chance of residuals beyond which they are not those of the same rigid object, and error of a finder that all
 # frames of a look have alike, px: by rendered tags that lie as they did.
-_BY_CHANCE, _ALIKE_PX = 1e-4, 0.02
+_BY_CHANCE, ALIKE_PX = 1e-4, 0.02
 # Of so many markers seen in a look, one that is off by itself may be left out.
 _SHARE = 8
 # Cosine of the angle between the axis of a turn and a line of markers, above which it is about that line.
@@ -199,7 +199,7 @@ def _elsewhere(rig: LookRig, fit: BundleFit) -> tuple[float, float, int, int] | 
     dof = len(r) - J.shape[1]
     if dof < 1:
         return None
-    share = 1.0 / np.hypot(1.0, _ALIKE_PX * np.repeat(fit.bundle.weight[fit.bundle.weight > 0.0], 2))
+    share = 1.0 / np.hypot(1.0, ALIKE_PX * np.repeat(fit.bundle.weight[fit.bundle.weight > 0.0], 2))
     J, seen = share[:, None] * J, np.column_stack([share * r, share[:, None] * fit.moved(rig, fit.X)])
     r, left = np.split(seen - J @ np.linalg.lstsq(J, seen)[0], [1], axis=1)
     r, along = r[:, 0], left.T @ r[:, 0]

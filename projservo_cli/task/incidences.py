@@ -18,14 +18,13 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import null_space, qr
-from scipy.spatial.transform import Rotation
 
 from projservo_cli.geometry.algebra import Mat4, apply, apply_transposed, as_array, dot, mat, meet, unit, vec
-from projservo_cli.geometry.displacements import twist_exponential
+from projservo_cli.geometry.displacements import to_all_sides, twist_exponential
 from projservo_cli.geometry.jit import inline, merged, njit
 from projservo_cli.geometry.kernels import COORDINATES
 from projservo_cli.geometry.kinematics import image_jacobian, project
-from projservo_cli.geometry.least_squares import Equations, minimize
+from projservo_cli.geometry.least_squares import Equations, levenberg_marquardt
 from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.metric.frame import invariant_upgrade
 from projservo_cli.records import (
@@ -54,8 +53,6 @@ _MET = 1e-6
 # that leads away from there.
 _FAR, _NUDGE = 1e6, 0.1
 
-# Turns to all sides, (24, 3) rotation vectors: none is farther than 63° from one.
-_TURNS = Rotation.create_group("O").as_rotvec()
 
 # Measure (p, 6) of motions (6, 4, 4) of points (m, 4).
 _Moved = Callable[[FloatArray, FloatArray], FloatArray]
@@ -94,6 +91,12 @@ class Incidences(NamedTuple):
     def weight(self) -> FloatArray:
         """Weights (w, r) of the rows in independent errors."""
         return self.rows[:, _WEIGHT:].T
+
+    def of(self, numbers: Sequence[int]) -> "Incidences":
+        """Select the rows and senses of some incidences, each row by itself."""
+        rows = self.rows[np.isin(self.rows[:, _GROUP], numbers)]
+        senses = self.senses[np.isin(self.senses[:, _OF], numbers)]
+        return _unweighted(self._replace(rows=rows, senses=senses))
 
     def weighing(self, weight: FloatArray) -> "Incidences":
         """Return the rows with other weights (w, r)."""
@@ -441,27 +444,16 @@ def each_in_pixels(
     """Rows in px as of where each incidence is met by itself; arguments as of ``weighted``."""
     moved, found = image_velocities(model, shows), []
     for k in np.unique(incidences.rows[:, _GROUP]).tolist():
-        one = only(incidences, [k])
+        one = incidences.of([k])
         found.append(weighted(one, model, body, nearest_goal(one, body, H, moved), shows, np.zeros(4)))
     rows = np.concatenate([one.rows[:, :_WEIGHT] for one in found])
     return NO_INCIDENCES._replace(rows=rows, senses=np.concatenate([one.senses for one in found]))
 
 
-def only(incidences: Incidences, numbers: Sequence[int]) -> Incidences:
-    """Return the rows and senses of some incidences, each row by itself."""
-    rows = incidences.rows[np.isin(incidences.rows[:, _GROUP], numbers)]
-    return _unweighted(incidences._replace(rows=rows, senses=_senses_of(incidences, numbers)))
-
-
-def _senses_of(incidences: Incidences, numbers: Sequence[int]) -> FloatArray:
-    """Senses (g, 11) of some incidences."""
-    return incidences.senses[np.isin(incidences.senses[:, _OF], numbers)]
-
-
 def least_errors(incidences: Incidences, body: Body, H: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Displacements (s, 4, 4) beside some at which all rows together err least, and their squares (s,), px².
 
-    incidences : of ``only``; each row that depends on others counts. H : (s, 4, 4). The square of a feature
+    incidences : each row by itself; one that depends on others counts. H : (s, 4, 4). The square of a feature
     that points the other way is that of half a turn.
     """
 
@@ -476,7 +468,7 @@ def least_errors(incidences: Incidences, body: Body, H: FloatArray) -> tuple[Flo
         twists = [np.tensordot(one, _motions(body, at), 1) for one, at in zip(step, H, strict=True)]
         return (np.array([as_array(twist_exponential(mat(twist))) for twist in twists]) @ H,)
 
-    (H,), there = minimize((H,), equations, moved, _STEPS)
+    (H,), there = levenberg_marquardt((H,), equations, moved, _STEPS)
     turned = [_turned_px(incidences, at) for at in H]
     return H, there.cost + np.square(turned).sum(axis=1)
 
@@ -494,8 +486,7 @@ def _away_at(incidences: Incidences, H: FloatArray) -> BoolArray:
 
 def turned_about(body: Body, H: FloatArray) -> FloatArray:
     """Displacements (25, 4, 4): H (4, 4), and with it turned about the body's middle to all sides."""
-    turns = np.einsum("bi,ijk->bjk", _TURNS, _motions(body, H)[3:])
-    return np.array([H, *(as_array(twist_exponential(mat(turn))) @ H for turn in turns)])
+    return np.concatenate([H[None], to_all_sides(_motions(body, H)[3:]) @ H])
 
 
 def image_error_at(incidences: Incidences, H: FloatArray) -> float:
@@ -554,7 +545,7 @@ def errors_px(incidences: Incidences, H: FloatArray) -> FloatArray:
         independent = _independent(half[group == k])
         weight = np.zeros((len(independent), len(group)))
         weight[:, group == k] = independent / math.sqrt(len(independent))
-        own.append(incidences.weighing(weight)._replace(senses=_senses_of(incidences, [int(k)])))
+        own.append(incidences.weighing(weight)._replace(senses=incidences.of([int(k)]).senses))
     none = np.zeros((0, 4, 4))
 
     def error(one: Incidences, at: FloatArray) -> float:

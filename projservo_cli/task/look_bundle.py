@@ -11,7 +11,6 @@ from typing import NamedTuple, Self
 
 import numpy as np
 from scipy.linalg import expm
-from scipy.spatial.transform import Rotation
 
 from projservo_cli.calibration.prediction import (
     error_factor_with_model,
@@ -19,8 +18,8 @@ from projservo_cli.calibration.prediction import (
     projection_derivative,
 )
 from projservo_cli.findings import REFUSES, Finding
-from projservo_cli.geometry.displacements import cross_matrix, generators
-from projservo_cli.geometry.least_squares import Equations, minimize
+from projservo_cli.geometry.displacements import cross_matrix, generators, to_all_sides
+from projservo_cli.geometry.least_squares import Equations, levenberg_marquardt
 from projservo_cli.geometry.lens import undistort
 from projservo_cli.metric.frame import ProjectiveParameters, changes_of, invariant_form
 from projservo_cli.records import BoolArray, Calibration, FloatArray, WorkFailed
@@ -41,8 +40,6 @@ _REGULAR = 1e-12
 _FIRST_STEPS, _PLACES = 12, 6
 # Step of the differences of gradients, over the deviation of a coordinate.
 _PROBE = 0.01
-# Turns that the search for a pose starts from, (24, 3) rotation vectors: none is farther than 63° from one.
-_TURNS = Rotation.create_group("O").as_rotvec()
 
 
 def unknown(one: Finding) -> WorkFailed:
@@ -215,7 +212,7 @@ class Bundle(NamedTuple):
         def moved(step: FloatArray, X: FloatArray, T: FloatArray) -> tuple[FloatArray, FloatArray]:
             return self.moved(X, T, step)
 
-        (X, T), there = minimize((X, T), equations, moved, steps)
+        (X, T), there = levenberg_marquardt((X, T), equations, moved, steps)
         return X, T, there.cost
 
     def poses(self, X: FloatArray, turns: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -224,7 +221,7 @@ class Bundle(NamedTuple):
         turns : (3, 3, 3) rotations that the search starts from.
         """
         center = X[:, :3].mean(axis=0)
-        R = expm(np.einsum("bi,ijk->bjk", _TURNS, generators(turns, center)[3:]))
+        R = to_all_sides(generators(turns, center)[3:])
         straight = undistort(self.lens, self.s[0])
         rows = self.P[:, None, :2] - straight[..., None] * self.P[:, None, 2:]
         rows = rows[self.weight[0] > 0.0]

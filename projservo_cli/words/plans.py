@@ -100,7 +100,7 @@ OF_GOAL = {
     "incidence": Row("{name} {amount}"),
     "incidence_name": Row("{name}"),
     "contradictory_incidences": Row(
-        "{each} contradict each other: wherever the tool is, its images are {amount} from meeting both, and "
+        "{each} contradict each other: wherever the tool is, its images are {amount} from meeting them, and "
         "noise explains {limit}",
         "leave one out, or change what they ask",
     ),

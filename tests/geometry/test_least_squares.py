@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
 
-from projservo_cli.geometry.least_squares import Equations, minimize
+from projservo_cli.geometry.least_squares import Equations, levenberg_marquardt
 
 TIMES = np.linspace(0.0, 3.0, 25)
 
@@ -25,7 +25,7 @@ def fitted(seen, start, moved=lambda step, x: (x + step,)):
         value, J = decays(x)
         return Equations.of(value - seen, J)
 
-    (x,), there = minimize((start,), equations, moved, 100)
+    (x,), there = levenberg_marquardt((start,), equations, moved, 100)
     return x, there
 
 
@@ -62,7 +62,7 @@ def test_what_nothing_shows_stays_where_it_was():
         value, J = decays(x[:, :3])
         return Equations.of(value - seen, np.concatenate([J, np.zeros((*J.shape[:2], 1))], axis=2))
 
-    (x,), _ = minimize(
+    (x,), _ = levenberg_marquardt(
         (np.column_stack([start, np.full(len(start), 7.0)]),), equations, lambda step, x: (x + step,), 50
     )
     np.testing.assert_array_equal(x[:, 3], 7.0)
@@ -77,7 +77,7 @@ def test_a_step_to_no_value_is_not_taken():
         value = np.where(x[:, 1:2] > 0.2, value, np.nan)
         return Equations.of(value - seen, J)
 
-    (x,), there = minimize((start,), equations, lambda step, x: (x + 40.0 * step,), 200)
+    (x,), there = levenberg_marquardt((start,), equations, lambda step, x: (x + 40.0 * step,), 200)
     assert (x[:, 1] > 0.2).all()
     assert (there.cost <= equations(start).cost).all()
 
@@ -89,6 +89,8 @@ def test_directions_that_nothing_shows_make_no_system_singular():
         return Equations.of(x.sum(axis=1)[:, None] - 1.0, np.ones((len(x), 1, x.shape[1])))
 
     for start in np.zeros(6), np.arange(6.0):
-        (x,), there = minimize((start[None],), equations, lambda step, x: (x + step,), 60, enough=-1.0)
+        (x,), there = levenberg_marquardt(
+            (start[None],), equations, lambda step, x: (x + step,), 60, enough=-1.0
+        )
         np.testing.assert_allclose(x.sum(), 1.0, atol=1e-12)
         assert there.cost < 1e-20
