@@ -450,7 +450,7 @@ class Chain:
     def _opened(self, inputs: ServoInputs) -> FloatArray:
         """Open the robot of somebody's, unless it is, and return where it stands (n,), rad or m."""
         from projservo_cli.stages.external_robot import opened_robot
-        from projservo_cli.stages.scenario import observed_numbers
+        from projservo_cli.stages.worlds.calibrated import observed_numbers
 
         c = self.run.calibration
         assert self.session is not None

@@ -58,14 +58,15 @@ def servo_inputs(config):
 
 
 def scenario_of(config, calibration=None):
-    """The scenario of the runs of a configuration."""
-    return scenario.run_scenario(servo_inputs(config), calibration)
+    """The scenario of the runs of a configuration, by a calibration or by one without errors."""
+    inputs = servo_inputs(config)
+    return scenario.run_scenario(inputs, calibration or inputs.plan.truth.calibration)
 
 
 def under(scenario, config, **more):
     """A scenario with other parts, under what another configuration gives its runs."""
     inputs = servo_inputs(config)
-    return replace(scenario, inputs=inputs.plan, servo=inputs, **more)
+    return replace(scenario, world=replace(scenario.world, inputs=inputs.plan), servo=inputs, **more)
 
 
 def trajectory_of(**asked):

@@ -5,6 +5,7 @@ from dataclasses import replace
 from projservo_cli.config import load_config
 from projservo_cli.settings.sections import JointVector
 from projservo_cli.stages.plan import plan_task
+from projservo_cli.stages.run_trace import trace_of
 from projservo_cli.stages.servo import drive
 from tests.configured import scenario_of, trajectory_of
 from tests.conftest import ROOT
@@ -38,7 +39,7 @@ def asked(profile="linear", samples=101, duration=None, ramp=0.0, **more):
 
 def planned(scenario, model, profile="linear", samples=11, **more):
     """Plan of a scenario with a model of it."""
-    delta = scenario.inputs.trajectory.visibility_fraction
+    delta = scenario.world.inputs.trajectory.visibility_fraction
     return plan_task(
         model, scenario.ends, asked(profile, samples, visibility_fraction=delta, **more), scenario.demands
     )
@@ -47,4 +48,4 @@ def planned(scenario, model, profile="linear", samples=11, **more):
 def driven(scenario, plan, name, model, **limits):
     """Trace of the run of a name with a model; ``limits`` replace those of the scenario."""
     scenario = replace(scenario, termination=scenario.termination._replace(**limits))
-    return drive(scenario, plan, name, model).trace()
+    return trace_of(drive(scenario, plan, name, model))

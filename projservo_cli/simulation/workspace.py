@@ -13,7 +13,16 @@ from projservo_cli.geometry.displacements import rigid
 from projservo_cli.geometry.kinematics import project
 from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.image_size import within_images
-from projservo_cli.records import VIEWS, BoolArray, FloatArray, Model, WorkFailed
+from projservo_cli.records import (
+    TOOL,
+    VIEWS,
+    WORLD,
+    BoolArray,
+    Calibration,
+    FloatArray,
+    Model,
+    WorkFailed,
+)
 from projservo_cli.settings.objects import Displacement
 from projservo_cli.settings.task import Goal
 from projservo_cli.simulation.analytic_plant import Ends, Plant
@@ -53,6 +62,50 @@ class Truth:
     def model(self) -> Model:
         """Metric model, for the plant and for the law that is given one."""
         return self.robot.model(self.P, self.lens, on_tool=self.on_tool)
+
+    @cached_property
+    def calibration(self) -> Calibration:
+        """Calibration of somebody who knows all this: without an error, and without a covariance."""
+        n, unknown = len(self.model.prismatic), np.full((0, 0), np.nan)
+        none, still, never = np.zeros((0, 3), dtype=np.int64), np.full(n, np.nan), np.zeros(n, dtype=np.bool_)
+        return Calibration(
+            method="bundle_adjustment",
+            source="simulated",
+            usable=True,
+            reason="known",
+            advice=(),
+            seconds=0.0,
+            view=self.view,
+            mount=TOOL if self.on_tool else WORLD,
+            joint_types="".join("P" if slides else "R" for slides in self.model.prismatic),
+            P=self.model.P,
+            H_hat_0=self.robot.H_hat_0,
+            q_reference=self.model.q_reference,
+            a_inf=self.model.a_inf,
+            marker=np.array(self.number, dtype=np.int64),
+            M=self.M,
+            lens=self.lens,
+            sqrt_cov_shared=np.full((1, 1), np.nan),
+            sqrt_cov_marker=unknown,
+            sqrt_cov_own=unknown,
+            rms_px=0.0,
+            sigma_px=0.0,
+            sigma_fitted_px=0.0,
+            chi2_per_dof=math.nan,
+            dof=0,
+            excitation=still,
+            joint_min=still,
+            poorly_observable=never,
+            operator_defect=still,
+            trace_defect=still,
+            plane_defect=still,
+            prediction_noise=unknown,
+            poses_used=0,
+            markers_used=len(self.M),
+            outlier=none,
+            suspect=none,
+            id_switches=none,
+        )
 
     @cached_property
     def M_face(self) -> FloatArray:

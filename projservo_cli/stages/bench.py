@@ -46,13 +46,20 @@ class Case:
     """A noisy run of 256 states of a simulated task and all that a step needs, with the true model."""
 
     def __init__(self, inputs: ServoInputs) -> None:
-        scenario = run_scenario(replace(inputs, plan=replace(inputs.plan, features="body")))
+        assert inputs.plan.truth is not None
+        given = replace(inputs, plan=replace(inputs.plan, features="body"))
+        scenario = run_scenario(given, inputs.plan.truth.calibration)
         shown, gains = scenario.exact, scenario.gains
-        self.m, self.q_start, self.model, self.gains = scenario.m, shown.q_start, scenario.model, gains
+        self.m, self.q_start, self.model, self.gains = (
+            scenario.world.m,
+            shown.q_start,
+            scenario.world.model,
+            gains,
+        )
         self.limits = scenario.termination._replace(
             image_error_px=1e-9, max_steps=STATES - 1, stop_at_border=False, stop_at_joint_limit=False
         )
-        seen = 2, len(scenario.numbers), 2
+        seen = 2, len(scenario.world.numbers), 2
         self.noise = NOISE_PX * np.random.default_rng(0).standard_normal((STATES, *seen))
         self.whole = self._run(shown.task(self.model), scenario.plant_of("exact"))
         self.points = self._run(shown.by_points().task(self.model), scenario.plant_of("stacked"))

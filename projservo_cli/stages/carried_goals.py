@@ -1,8 +1,6 @@
 """The object that a goal was taught on: looked at anew, and the goal carried along."""
 
 import math
-import time
-from contextlib import nullcontext
 from dataclasses import fields
 from typing import Any
 
@@ -13,12 +11,7 @@ from projservo_cli.calibration.prediction import error_factor_with_model, requir
 from projservo_cli.findings import REFUSES, Finding, Subject
 from projservo_cli.metric.frame import Metric, Scale
 from projservo_cli.records import Calibration, CarriedByObject, InputError, Plan, WorkFailed
-from projservo_cli.robots.contract import Reading
 from projservo_cli.robots.session import Session
-from projservo_cli.robots.standstill import seen_at_rest
-from projservo_cli.simulation.faults import observed_in_frames
-from projservo_cli.simulation.streams import OBJECT_NOW, OBJECT_TAUGHT, generator
-from projservo_cli.stages.external_robot import opened_robot
 from projservo_cli.stages.scenario import Scenario
 from projservo_cli.stages.stage_inputs import CarryingObject, KnownLengths
 from projservo_cli.task.displaced_object import DisplacedObject
@@ -60,15 +53,9 @@ def carried_goal(
     if before is not None and before.s_carried is not None:
         known = {one.name: getattr(before, one.name) for one in fields(CarriedByObject)}
         return scenario.carried(before.s_carried), known
-    c = scenario.calibration
-    assert c is not None
+    c = scenario.world.calibration
     metric, _ = in_metres(c, carrier.lengths)
-    taught = _taught(scenario, carrier)
-    now = (
-        _simulated(scenario, carrier, now=True)
-        if carrier.driven is None
-        else _seen(scenario, carrier, session)
-    )
+    taught, now = scenario.world.look(carrier, session, scenario.exact.q_start, scenario.q_taught)
     try:
         found = DisplacedObject.of(c, carrier.numbers, [taught, now], metric)
         goal = found.carry(_goal(scenario, c))
@@ -87,7 +74,7 @@ def carried_goal(
         "object_left_out": ", ".join(map(str, found.left_out)) or None,
         "s_object": now.s,
         "sigma_object": now.sigma,
-        "s_carried": np.ascontiguousarray(goal.s[:, c.indices_of(scenario.numbers)]),
+        "s_carried": np.ascontiguousarray(goal.s[:, c.indices_of(scenario.world.numbers)]),
     }
     for unit in ("mm", "px"):
         key, at = f"max_goal_deviation_{unit}", found_now[f"goal_deviation_{unit}"]
@@ -121,66 +108,13 @@ def _known(number: float) -> float | None:
     return None if math.isnan(number) else number
 
 
-def _taught(scenario: Scenario, carrier: CarryingObject) -> Look:
-    """Images of the object when the goal was taught."""
-    images = carrier.taught
-    if images is None:
-        return _simulated(scenario, carrier, now=False)
-    pixels, unseen = images.pixels((), scenario.view), ((math.nan, math.nan),) * len(scenario.view)
-    shown = np.array([pixels.get(number, unseen) for number in carrier.numbers]).swapaxes(0, 1)
-    told = [number for number in carrier.numbers if number in pixels]
-    sigma = np.full(shown.shape[:2], np.nan)
-    known = [number in told for number in carrier.numbers]
-    sigma[:, known] = np.array(images.deviations(told, (), scenario.view)).reshape(len(shown), -1)
-    return Look(shown, sigma)
-
-
-def _seen(scenario: Scenario, carrier: CarryingObject, shared: Session | None) -> Look:
-    """Images of the object by a robot where it stands; it is not moved."""
-    driven, c = carrier.driven, scenario.calibration
-    assert c is not None
-    assert driven is not None
-    numbers = scenario.observed
-    with nullcontext(shared) if shared else Session() as session:
-        robot = opened_robot(session, driven, scenario.joints, numbers, c.view).robot
-
-        def observe() -> Reading:
-            time.sleep(robot.bounds.period)
-            return robot.read().whole
-
-        _, mean, sigma, *_ = seen_at_rest(robot, observe, carrier.frames, carrier.settle_s, "plan")
-    which = [len(numbers) + driven.further.index(number) for number in carrier.numbers]
-    return Look(mean.s[:, which], sigma[:, which])
-
-
-def _simulated(scenario: Scenario, carrier: CarryingObject, *, now: bool) -> Look:
-    """Images of a simulated object: now, or when the goal was taught.
-
-    The arm is at the start of the task meanwhile, or where the goal was taught.
-    """
-    inputs, truth, placed = scenario.inputs, scenario.truth, carrier.placed
-    assert truth is not None
-    assert placed is not None
-    drawn = inputs.seed, OBJECT_NOW if now else OBJECT_TAUGHT
-    if inputs.scene is not None:
-        scene = inputs.scene if now else carrier.at_first
-        q = scenario.exact.q_start if now else scenario.q_taught
-        assert scene is not None
-        assert q is not None
-        which = [scene.numbers.index(number) for number in carrier.numbers]
-        s, sigma = observed_in_frames(scene, inputs.averaged_frames, q, drawn)
-        return Look(s[:, which], sigma[:, which])
-    s = placed.images(truth, placed.T if now else np.eye(4))
-    noise = inputs.noise_px / math.sqrt(inputs.averaged_frames)
-    s += noise * truth.noise.draw(generator(*drawn), s.shape)
-    return Look(s, np.full(s.shape[:2], noise) if noise > 0.0 else None)
-
-
 def _goal(scenario: Scenario, c: Calibration) -> Look:
     """Images of the markers of the calibration at the goal as it was taught, and their deviations."""
     if (given := scenario.goal_pixels) is not None:
         return Look(*given)
     s = np.full((len(c.view), len(c.marker), 2), np.nan)
-    s[:, c.indices_of(scenario.numbers)] = scenario.shown_at(scenario.inputs.seed).s_star
-    noise = scenario.inputs.noise_px / math.sqrt(scenario.inputs.averaged_frames)
+    s[:, c.indices_of(scenario.world.numbers)] = scenario.world.shown(
+        scenario.exact, scenario.q_taught, scenario.world.inputs.seed
+    ).s_star
+    noise = scenario.world.inputs.noise_px / math.sqrt(scenario.world.inputs.averaged_frames)
     return Look(s, np.full(s.shape[:2], noise) if noise > 0.0 else None)

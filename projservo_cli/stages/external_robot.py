@@ -1,41 +1,25 @@
-"""Robots of the contract: made, checked against the calibration, driven to given joints."""
+"""Robots of the contract: made, opened, driven to given joints."""
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
 
 import numpy as np
 
 from projservo_cli import plugins, words
-from projservo_cli.calibration.prediction import predict
 from projservo_cli.detection import finder_of
 from projservo_cli.findings import REFUSES, Finding, Subject
-from projservo_cli.geometry.algebra import mat
 from projservo_cli.hardware.camera_robot import Arm, CameraRobot
-from projservo_cli.image_size import image_sizes
-from projservo_cli.monitoring.image_monitor import ImageMonitor
-from projservo_cli.monitoring.innovation_tests import WINDOW
 from projservo_cli.passwords import MASK
-from projservo_cli.records import Calibration, FloatArray, InputError, Plan, WorkFailed
-from projservo_cli.robots.client import DrivenRobot, Known
+from projservo_cli.records import FloatArray, InputError, WorkFailed
 from projservo_cli.robots.contract import Bounds, PluginRobot, Reading, Robot
-from projservo_cli.robots.latency import DelayPrior
-from projservo_cli.robots.object_watch import ObjectWatch
 from projservo_cli.robots.pacing import Steered
 from projservo_cli.robots.session import Session
 from projservo_cli.robots.settings import Joints
 from projservo_cli.robots.standstill import STILL, Standstill, at_rest
-from projservo_cli.settings.disturbance import EachView, Events
-from projservo_cli.simulation.analytic_plant import Plant, observe
-from projservo_cli.simulation.faults import FaultyRobot, Points, SimulatedRobot, obstruction_of, robot_of
-from projservo_cli.simulation.streams import SERVO_NOISE
-from projservo_cli.stages.scenario import RunScenario
-from projservo_cli.stages.stage_inputs import Contract, Drive, OwnRobot
-from projservo_cli.task.displaced_object import images_by_motion
+from projservo_cli.simulation.faults import FaultyRobot, obstruction_of
+from projservo_cli.stages.stage_inputs import Drive, OwnRobot
 
 _NEVER_LATE_S = 3600.0  # for a simulated robot, whose code may be compiled first
-# Minimum deviation of a delay and of single frames, s; width of a 95 % interval in deviations.
-_LEAST_JITTER_S, _INTERVAL = 0.002, 3.92
 
 
 def plugin_robot(
@@ -185,24 +169,6 @@ def simulated_robot(driven: Drive, joints: Joints, robot: FaultyRobot) -> Plugin
     return PluginRobot(robot, "the simulated robot", markers, bounds, *late, objects=len(driven.further))
 
 
-def _in_the_loop(scenario: RunScenario, robot: SimulatedRobot, events: Events) -> FaultyRobot:
-    """The simulated robot of a scenario at the start of the task, which observes all markers."""
-    truth, plant = robot.truth, scenario.plant_of("exact")
-    face, others, workspace = list(truth.face), list(truth.pins), np.zeros_like(plant.M)
-
-    def see(q: FloatArray, M: FloatArray) -> FloatArray:
-        """Return the pixels of markers (m, 4) in all views at joints (n,)."""
-        s, ordered = np.zeros((2, len(truth.P), len(M), 2))
-        H = mat(truth.displacement(q))
-        observe(plant._replace(M=M[face], pins=M[others]), H, workspace, ordered, np.zeros(len(ordered)))
-        s[:, face + others] = ordered
-        return s
-
-    points = Points(truth, see, False, scenario.inputs.noise_px)
-    drawn = scenario.inputs.seed, SERVO_NOISE
-    return robot_of(robot, scenario.exact.q_start, points, drawn, events)
-
-
 def opened_robot(
     session: Session,
     driven: Drive,
@@ -223,101 +189,3 @@ def opened_robot(
     bounds, types = driven.following.bounds(joints), joints.types
     known, further = (driven.robot, bounds, types, observed), driven.further
     return session.opened(plugin_robot(*known, given, view, further=further))
-
-
-def connected_robot(
-    scenario: RunScenario,
-    law: str,
-    session: Session,
-    given: Robot | None = None,
-    plan: Plan | None = None,
-) -> DrivenRobot:
-    """Return the robot, open, as the loop of a law sees it: with its truth, or with the calibrated model.
-
-    session : which it is opened in, unless it is.
-    given : an object of the contract instead of one of a class.
-    plan : of which the object is watched, if its goal is carried by one.
-    """
-    contract, calibration = scenario.servo.contract, scenario.calibration
-    assert calibration is not None
-    assert contract is not None
-    driven = contract.driven
-    if isinstance(driven.robot, OwnRobot):
-        plant = _believed_plant(scenario, calibration)
-        known = scenario.joints, scenario.observed, calibration.view
-        steered = opened_robot(session, driven, *known, given)
-    else:
-        plant = scenario.plant_of(law)
-        steered = session.steered or session.opened(
-            simulated_robot(driven, scenario.joints, _in_the_loop(scenario, driven.robot, contract.events))
-        )
-    monitor = None
-    if not scenario.untested:
-        noise = scenario.servo.stop.innovation_threshold * scenario.noise_px
-        visible = np.flatnonzero(np.isin(calibration.marker, scenario.observed))
-        readings = scenario.termination.max_steps + 1 + WINDOW
-        monitor = ImageMonitor(calibration, noise, readings, visible, plant.image_size)
-    watch = None
-    if plan is not None and plan.s_object is not None and plan.object_marker is not None:
-        name, numbers = plan.object_name or "", plan.object_marker.tolist()
-        places = np.array([driven.further.index(number) for number in numbers])
-        if name not in session.held.values():  # else it moves with the tool
-            sigma, by_motion = plan.sigma_object, images_by_motion(calibration, plan.s_object)
-            sigma = np.full(plan.s_object.shape[:2], np.nan) if sigma is None else sigma
-            watch = ObjectWatch(name, numbers, places, plan.s_object, sigma, by_motion)
-    session.at = watch if scenario.inputs.displaced is None else None
-    return DrivenRobot(steered, plant, _known_of(scenario, contract, calibration, law), monitor, watch)
-
-
-def _believed_plant(scenario: RunScenario, calibration: Calibration) -> Plant:
-    """Return the calibrated robot and its face."""
-    images = scenario.ends.by_points() if len(scenario.ends.pair) else scenario.ends
-    task = images._replace(incidences=()).task(scenario.model)  # the face of the goal, whatever is judged
-    return Plant(
-        model=scenario.model,
-        M=np.ascontiguousarray(calibration.M[calibration.indices_of(scenario.numbers[: scenario.m])]),
-        order=task.order,
-        center=task.center,
-        O=task.O,
-        visible=task.visible,
-        image_size=image_sizes(scenario.inputs.image_size, scenario.view),
-        limits=scenario.joints.limits,
-        opaque=False,
-        least_views=scenario.least_views,
-    )
-
-
-def _known_of(scenario: RunScenario, contract: Contract, calibration: Calibration, law: str) -> Known:
-    """Return the knowledge of a robot and its images before a law drives it."""
-    numbers = scenario.observed
-    return Known(
-        predicted=partial(predict, calibration),
-        visible=np.array([numbers.index(number) for number in scenario.numbers_of(law)]),
-        order=np.array([numbers.index(k) if k in numbers else -1 for k in calibration.marker.tolist()]),
-        sigma_px=scenario.noise_px,
-        sigma_scale=calibration.sigma_scale or 1.0,
-        sigma_q=scenario.joints.length_of(math.degrees(calibration.sigma_q or 0.0)),
-        delays=_delays_of(contract.time_offset_s, calibration),
-        timeout_s=contract.timeout_s,
-        max_force_n=scenario.servo.stop.max_force_n,
-    )
-
-
-def _delays_of(given: EachView | None, calibration: Calibration) -> DelayPrior:
-    """Return the prior of the delays of all views: given, calibrated, or wide."""
-    view = calibration.view
-    known = DelayPrior.unknown(len(view))
-    if calibration.time_offset_s is not None:
-        interval, jitter = calibration.time_offset_interval_s, calibration.time_offset_jitter_s
-        assert interval is not None
-        assert jitter is not None
-        sigma = np.maximum(np.ptp(interval, axis=1) / _INTERVAL, 0.5 * _LEAST_JITTER_S)
-        known = DelayPrior(calibration.time_offset_s.copy(), sigma, np.maximum(jitter, _LEAST_JITTER_S))
-    if given is not None:
-        if missing := [name for name in view if given.of(name) is None]:
-            raise InputError(
-                f"plant.time_offset_s: names no {', '.join(missing)}: give their numbers, or others"
-            )
-        mean = np.array([given.of(name) for name in view], float)
-        known = known._replace(mean=mean, sigma=np.zeros(len(view)))
-    return known

@@ -91,21 +91,17 @@ class JointSearch(NamedTuple):
 
 def search_of(scenario: Scenario) -> JointSearch:
     """Return the inputs of a search through joint space."""
-    calibration, spread = scenario.calibration, NO_SPREAD
-    if calibration is not None:
-        numbers = scenario.numbers if len(scenario.ends.body.M) else scenario.numbers[: scenario.m]
-        demands = scenario.demands
-        spread = spread_of(
-            calibration,
-            tuple(calibration.indices_of(numbers)),
-            scenario.m,
-            (tuple(demands.limits.lower), tuple(demands.limits.upper), tuple(map(tuple, demands.image_size))),
-            scenario.inputs.trajectory.search.seed,
-            scenario.least_views,
-        )
-    limits = scenario.joints.limits
-    known = scenario.truth is not None or np.isfinite([limits.lower, limits.upper]).all()
-    closed = None if known else Finding("unknown_limits", REFUSES)
+    world, demands = scenario.world, scenario.demands
+    numbers = world.numbers if len(scenario.ends.body.M) else world.numbers[: world.m]
+    spread = spread_of(
+        world.calibration,
+        tuple(world.calibration.indices_of(numbers)),
+        world.m,
+        (tuple(demands.limits.lower), tuple(demands.limits.upper), tuple(map(tuple, demands.image_size))),
+        world.inputs.trajectory.search.seed,
+        scenario.world.least_views,
+    )
+    closed = None if world.knows_limits(world.joints.limits) else Finding("unknown_limits", REFUSES)
     return JointSearch(scenario.joints_at_goal, scenario.goal_sigma_px, spread, closed)
 
 
@@ -235,7 +231,11 @@ class PathReplanner:
     """Paths to the goal of a scenario, of which a plan was made."""
 
     def __init__(self, scenario: Scenario, plan: Plan) -> None:
-        model, images, self._trajectory = scenario.model, scenario.ends, scenario.inputs.trajectory
+        model, images, self._trajectory = (
+            scenario.world.model,
+            scenario.ends,
+            scenario.world.inputs.trajectory,
+        )
         task, amplitudes = images.task(model), np.array([plan.tau, plan.theta_r, plan.theta_p])
         self._plan, self._search, self._made = plan, search_of(scenario), 0
         parts = plan.H_hat, amplitudes, plan.A, plan.a

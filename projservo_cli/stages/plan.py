@@ -145,7 +145,7 @@ def run(
     if inputs.carrier is not None:
         scenario, carried = carried_goal(scenario, inputs.carrier, before, session)
     plan = _to_any_goal(scenario) if inputs.incidences else _plan_in(scenario)
-    face = metric_points(scenario.model, calibration.M[calibration.indices_of(inputs.face)])
+    face = metric_points(scenario.world.model, calibration.M[calibration.indices_of(inputs.face)])
     further = (
         *calibration.open_order,
         *_borders(inputs, calibration.view),
@@ -157,9 +157,9 @@ def run(
 
 def _plan_in(scenario: Scenario) -> Plan:
     """Plan the task of a scenario as its trajectory is asked for; raises as ``plan_task``."""
-    asked = scenario.inputs.trajectory
+    asked = scenario.world.inputs.trajectory
     search = search_of(scenario) if asked.needs_covariance else None
-    return plan_task(scenario.model, scenario.ends, asked, scenario.demands, search)
+    return plan_task(scenario.world.model, scenario.ends, asked, scenario.demands, search)
 
 
 # Goals to which a motion is planned until one is feasible.
@@ -171,17 +171,17 @@ def _to_any_goal(scenario: Scenario) -> Plan:
 
     Raises WorkFailed where no joints meet all incidences, with those that fail, or no motion leads to a goal.
     """
-    model, ends = scenario.model, scenario.ends
+    model, ends = scenario.world.model, scenario.ends
     H_taught, shows = ends.displacement_taught(model), np.isfinite(ends.taught().s_star[..., 0])
     asked, sigma_px = ends.incidences, scenario.goal_error_px
     apart = tuple(contradictions(model, ends.body, H_taught, asked, shows, sigma_px))
     if not usable(apart):
         raise failed([one for one in apart if one.severity == REFUSES])
-    state, task, _, _ = _partitioned(model, ends, scenario.inputs.trajectory, scenario.demands.limits)
+    state, task, _, _ = _partitioned(model, ends, scenario.world.inputs.trajectory, scenario.demands.limits)
     names = tuple(one.name for one in asked)
     body = body_at_start(model, task, ends, state.A)
     c = constraints_of(model, body, task, ends.q_start, scenario.demands)
-    seed = scenario.inputs.trajectory.search.seed
+    seed = scenario.world.inputs.trajectory.search.seed
     goals, nearest = goals_meeting(c, task.incidences, ends.q_start, scenario.goal_joints, seed, _LEFT_PX)
     if not len(goals):
         (left,) = errors_px(task.incidences, forward_kinematics(model, nearest)[None])
@@ -234,12 +234,12 @@ def _require_taught_since(scenario: Scenario, calibration: Calibration) -> None:
 
     Images without joint readings are tested where the arm shows them best.
     """
-    task = scenario.inputs.task
+    task = scenario.world.inputs.task
     images = task.goal.images if task is not None else None
     if images is None or (whole := scenario.goal_pixels) is None:
         return
-    view, face = calibration.view, scenario.inputs.face
-    pixels, size = images.pixels(face, view), image_sizes(scenario.inputs.image_size, view)
+    view, face = calibration.view, scenario.world.inputs.face
+    pixels, size = images.pixels(face, view), image_sizes(scenario.world.inputs.image_size, view)
     numbers, seen = np.array([*pixels]), np.swapaxes(np.array([*pixels.values()]), 0, 1)
     if images.joints is not None:
         q = images.joints.values(calibration.joint_types)
@@ -247,8 +247,8 @@ def _require_taught_since(scenario: Scenario, calibration: Calibration) -> None:
             raise failed([fault], setup_of(calibration), "; teach it again", stage=CHANGED)
         _require_rigid(rigid_fit(calibration, q, *whole), setup_of(calibration), "teach it again")
         return
-    stated = images.sigma_px(scenario.numbers[: scenario.m], scenario.inputs.face)
-    sigma = scenario.noise_px if stated is None else stated
+    stated = images.sigma_px(scenario.world.numbers[: scenario.world.m], scenario.world.inputs.face)
+    sigma = scenario.world.noise_px if stated is None else stated
     known, near_px = np.isin(numbers, calibration.marker), max(NEAR_PX, 2.0 * sigma)
     shown = numbers[known].tolist(), seen[:, known]
     q, median = joints_showing(calibration, *shown, scenario.exact.q_start, near_px)
@@ -491,6 +491,6 @@ def _senses(parts: Parts, task: Task) -> tuple[FloatArray, FloatArray]:
 
 def rotation_sense(scenario: Scenario) -> FloatArray:
     """Joint motions (2, n) of both rotations in the sense of a plan whose profile rehearses half turns."""
-    asked, joints = scenario.inputs.trajectory, scenario.joints
-    state, _, parts, _ = _partitioned(scenario.model, scenario.ends, asked, joints.limits)
+    asked, joints = scenario.world.inputs.trajectory, scenario.world.joints
+    state, _, parts, _ = _partitioned(scenario.world.model, scenario.ends, asked, joints.limits)
     return in_sense(parts.theta_r, parts.theta_p, _joint_motions(state)[1:3])

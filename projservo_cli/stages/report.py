@@ -50,6 +50,7 @@ from projservo_cli.simulation.workspace import Truth, plant_of
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.carried_goals import in_metres
 from projservo_cli.stages.plan import plan_task
+from projservo_cli.stages.run_trace import trace_of
 from projservo_cli.stages.scenario import RunScenario, run_scenario
 from projservo_cli.stages.servo import drive
 from projservo_cli.stages.stage_inputs import ReportInputs, Scenery, ServoInputs
@@ -91,8 +92,7 @@ class Comparison:
     @property
     def truth(self) -> Truth:
         """Robot, rig and markers as they are."""
-        assert self.scenario.truth is not None
-        return self.scenario.truth
+        return self.scenario.simulated.truth
 
     def run(self, law: str, operators: str, gains: Gains, *, limited: bool) -> Trace:
         """Drive a direct law without limit, or with 5° a step and that of prismatic joints as configured."""
@@ -103,21 +103,21 @@ class Comparison:
             prismatic = self.truth.robot.prismatic
             speed = np.where(prismatic, limits.speed, math.radians(STEP_LIMIT_DEG) / gains.period)
         scenario = replace(seen, gains=gains, termination=limits._replace(speed=speed))
-        return drive(scenario, self.plan.rotation_sense(), law, self.models[operators]).trace()
+        return trace_of(drive(scenario, self.plan.rotation_sense(), law, self.models[operators]))
 
     def followed(self) -> Trace | None:
         """Drive directTHREE along the plan, with the configured limits; None where it cannot be followed."""
         if not self.plan.feasible or self.plan.duration is None or np.isnan(self.plan.mu).any():
             return None
         law = run_name(DIRECT[0], TRACK)
-        return drive(self.scenario, self.plan, law, self.models["calibrated"]).trace()
+        return trace_of(drive(self.scenario, self.plan, law, self.models["calibrated"]))
 
     def scenario_by(self, operators: str) -> RunScenario:
         """Return the setting with the body, where the face is measured with one, in the frame of a model."""
         exact = self.scenario.exact
         if operators == "calibrated" or not len(exact.body.M):
             return self.scenario
-        M = self.truth.of(self.scenario.numbers)
+        M = self.truth.of(self.scenario.world.numbers)
         if operators == "twin":
             M = M @ np.linalg.inv(H_PE).T
         return replace(self.scenario, exact=exact._replace(body=make_body(self.models[operators], M)))
@@ -150,8 +150,7 @@ def comparison_of(inputs: ServoInputs, calibration: Calibration, plan: Plan) -> 
     scenario = run_scenario(inputs, calibration)
     limits = scenario.termination._replace(stop_at_joint_limit=False, stop_at_border=False)
     scenario = replace(scenario, termination=limits)
-    assert scenario.truth is not None
-    metric = scenario.truth.model
+    metric = scenario.simulated.truth.model
     models = {"true": metric, "twin": projective_twin(metric), "calibrated": calibration.model()}
     return Comparison(scenario, models, plan)
 
@@ -203,9 +202,9 @@ def run_studies(
 
 def metric_plan(bench: Comparison) -> Plan:
     """The task partitioned with the true metric model, so that its operators are in metres."""
-    asked, robot = bench.scenario.inputs.trajectory, bench.truth.robot
+    asked, robot = bench.scenario.world.inputs.trajectory, bench.truth.robot
     trajectory = asked.model_copy(update={"profile": "linear", "n_samples": 2, "duration_s": None})
-    shown, limits = bench.scenario_by("true").ends, limits_alone(robot.limits, len(bench.scenario.view))
+    shown, limits = bench.scenario_by("true").ends, limits_alone(robot.limits, len(bench.scenario.world.view))
     return plan_task(bench.models["true"], shown, trajectory, limits)
 
 

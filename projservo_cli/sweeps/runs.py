@@ -28,6 +28,7 @@ from projservo_cli.records import (
 from projservo_cli.result_hashes import key_of
 from projservo_cli.stages import plan as planning
 from projservo_cli.stages.plan import rotation_sense
+from projservo_cli.stages.run_trace import trace_of
 from projservo_cli.stages.scenario import RunScenario, run_scenario
 from projservo_cli.stages.servo import drive, sense_is_enough
 from projservo_cli.stages.stage_inputs import PlanInputs, ServoInputs
@@ -241,9 +242,9 @@ def _measured(
         numbers = _numbers_of(scenario, name, seeds.tolist())
     except WorkFailed as error:
         return {"verdict": _NOT_STARTED}, [str(error)] * len(seeds)
-    names = (*NUMBERS, *_self_occluded(scenario.view))
+    names = (*NUMBERS, *_self_occluded(scenario.world.view))
     found: dict[str, Any] = dict(zip(names, numbers.T, strict=True))
-    for column in measured_columns(scenario.view):
+    for column in measured_columns(scenario.world.view):
         if column.dtype == "i8":
             found[column.name] = np.where(numbers[:, VERDICT] < 0, _NONE, found[column.name])
     found["success"] = found["success"] == 1.0
@@ -261,26 +262,28 @@ def _numbers_of(scenario: RunScenario, law: str, seeds: Sequence[int]) -> FloatA
     """Numbers (k, ``NUMBERS`` + V) of the runs of seeds (k), each a function of its seed alone."""
     setting = Setting(
         code=CODES[law],
-        model=scenario.model,
+        model=scenario.world.model,
         believed=scenario.believed_by(law),
         body=scenario.exact.body,
         shares_task=scenario.measures_body(law),
-        rehearse=scenario.inputs.trajectory.rehearses,
+        rehearse=scenario.world.inputs.trajectory.rehearses,
         gains=scenario.gains,
         course=Course(scenario.plant_of(law), scenario.termination, scenario.exact.q_start),
         ends=scenario.true_ends,
         pair=scenario.exact.pair,
         q_near=scenario.exact.q_near,
     )
-    batch = Batch(setting, len(scenario.numbers))
-    found = np.empty((len(seeds), len(NUMBERS) + len(scenario.view)))
+    batch = Batch(setting, len(scenario.world.numbers))
+    found = np.empty((len(seeds), len(NUMBERS) + len(scenario.world.view)))
     for first in range(0, len(seeds), _TOGETHER):
         running, instants = list(range(first, min(first + _TOGETHER, len(seeds)))), _INSTANTS
         while running:  # those that outlast their noise are repeated with more
             drawn = min(instants, scenario.termination.max_steps + 1)
             displayed = [scenario.images_at(seeds[i]) for i in running]
             images = np.array([(ends.s_start, ends.s_star) for ends in displayed])
-            noise = np.array([scenario.noise_of(law, seeds[i], drawn) for i in running])
+            noise = np.array(
+                [scenario.simulated.noise(scenario.numbers_of(law), seeds[i], drawn) for i in running]
+            )
             found[running] = batch.numbers(images, noise)
             running = [i for i in running if found[i, VERDICT] == RUNNING]
             instants *= _FURTHER
@@ -328,11 +331,11 @@ def _run(
     except WorkFailed as error:
         return {"verdict": _NOT_STARTED}, None, str(error)
     row = {"verdict": made.verdict, "steps": made.steps, **made.summary._asdict()}
-    row |= zip(_self_occluded(scenario.view), made.self_occluded_steps, strict=True)
+    row |= zip(_self_occluded(scenario.world.view), made.self_occluded_steps, strict=True)
     if design.sweep.between_samples:
         row[BETWEEN.name] = made.deviation_mm()
     return (
         row,
-        made.trace() if keep else None,
+        trace_of(made) if keep else None,
         "" if made.why is None or not VERDICTS[made.verdict].retried else line(made.why, made.setup),
     )

@@ -40,7 +40,7 @@ def test_drift_falls_with_the_gain_and_with_the_limit(arm, law):
         gains = [f"control.gain_{part}={gain / 0.04}" for part in "trps"]
         for limit, drift in drifts.items():
             scenario = known_scenario(configured(arm, *gains, f"control.joint_speed_limit_deg_s={limit}"))
-            model = scenario.truth.model
+            model = scenario.simulated.truth.model
             drift.append(driven(scenario, planned(scenario, model), law, model).center_deviation_mm)
     free, limited = map(np.array, drifts.values())
     assert np.all(np.diff(free) < 0), free

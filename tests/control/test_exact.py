@@ -12,7 +12,7 @@ from tests.known import configured, driven, known_scenario, planned
 def exact_run(arm, gain, limit, *overrides):
     gains = [f"control.gain_{part}={gain / 0.04}" for part in "ts"]
     scenario = known_scenario(configured(arm, *gains, f"control.joint_speed_limit_deg_s={limit}", *overrides))
-    model = scenario.truth.model
+    model = scenario.simulated.truth.model
     return driven(scenario, planned(scenario, model, samples=3), "exact", model)
 
 

@@ -6,9 +6,9 @@ import numpy as np
 
 from projservo_cli.laws import IMAGE_TRACK, LAWS, REGULATE, TRACK, law_and_mode, run_names
 from projservo_cli.records import InputError, WorkFailed
+from projservo_cli.stages.law_run import LawRun
 from projservo_cli.stages.motions import search_of
 from projservo_cli.stages.plan import plan_task
-from projservo_cli.stages.servo import LawRun
 from tests.configured import scenario_of
 from tests.known import asked
 
@@ -28,7 +28,7 @@ def highest_shares(config, profiles=("linear",), max_steps=40):
     for profile in profiles:
         motion, search = asked(profile, samples=11), search_of(scenario)
         try:
-            plan = plan_task(scenario.model, scenario.ends, motion, scenario.demands, search)
+            plan = plan_task(scenario.world.model, scenario.ends, motion, scenario.demands, search)
         except (InputError, WorkFailed):
             continue
         for name in RUNS:

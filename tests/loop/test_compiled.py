@@ -151,11 +151,11 @@ def test_success_is_told_of_the_truth(rng):
 def test_records_are_of_the_types_of_a_run():
     scenario = known_scenario(configured("paper"))
     real = {
-        Law: make_law(0, scenario.model, scenario.ends.task(scenario.model), scenario.gains),
+        Law: make_law(0, scenario.world.model, scenario.ends.task(scenario.world.model), scenario.gains),
         Course: Course(scenario.plant_of("exact"), scenario.termination, scenario.exact.q_start),
         Plant: scenario.plant_of("exact"),
-        State: new_state(6, scenario.m),
-        Log: new_log(6, scenario.m, 3, len(ERRORS)),
+        State: new_state(6, scenario.world.m),
+        Log: new_log(6, scenario.world.m, 3, len(ERRORS)),
         Ends: scenario.true_ends,
     }
     met = set()

@@ -47,17 +47,19 @@ def test_limits_from_data_are_what_they_cover_widened_by_a_share_of_it(mine):
     config, calibration = mine("robot.limits.from_data=0.1")
     low, high = REFERENCE - np.radians(30.0), REFERENCE + np.radians(30.0)
     scenario = scenario_of(config, calibration)
-    np.testing.assert_allclose(scenario.joints.limits.lower, low - np.radians(6.0), atol=1e-6)
-    np.testing.assert_allclose(scenario.joints.limits.upper, high + np.radians(6.0), atol=1e-6)
+    np.testing.assert_allclose(scenario.world.joints.limits.lower, low - np.radians(6.0), atol=1e-6)
+    np.testing.assert_allclose(scenario.world.joints.limits.upper, high + np.radians(6.0), atol=1e-6)
     # Laws never pass them.
-    np.testing.assert_array_equal(scenario.gains.limits.lower, scenario.joints.limits.lower)
+    np.testing.assert_array_equal(scenario.gains.limits.lower, scenario.world.joints.limits.lower)
     np.testing.assert_array_equal(
         read_table(config.data.table, "RRRRRR", "rad").q.min(axis=0), calibration.joint_min
     )
     through_joints = config.trajectory.model_copy(update={"profile": "joint_space"})
     found = plan.run(config.model_copy(update={"trajectory": through_joints}), calibration)
     assert found.feasible, found.reason
-    assert ((found.q > scenario.joints.limits.lower) & (found.q < scenario.joints.limits.upper)).all()
+    assert (
+        (found.q > scenario.world.joints.limits.lower) & (found.q < scenario.world.joints.limits.upper)
+    ).all()
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ from projservo_cli.planning.rrt_connect import margins_at
 from projservo_cli.simulation.arm import METRIC_A_INF
 from projservo_cli.stages.motions import search_of
 from projservo_cli.stages.plan import plan_task
+from projservo_cli.stages.run_trace import trace_of
 from projservo_cli.stages.servo import drive
 from tests.configured import calibrate, scenario_of
 from tests.known import configured
@@ -50,7 +51,7 @@ def in_truth(truth, q):
 
 def test_the_tag_that_counts_is_the_best_of_all_tried_one_by_one():
     made = scenario()
-    truth, q_start = made.truth, made.ends.q_start
+    truth, q_start = made.simulated.truth, made.ends.q_start
     A = truth.M @ truth.displacement(q_start).T
     c = constraints_of(truth.model, A, made.ends.task(truth.model), q_start, made.demands)
     first = in_truth(truth, q_start)[0, :2]
@@ -81,10 +82,10 @@ def limited(made):
 def test_the_middle_tag_may_turn_away_where_another_stays_in_sight(profile):
     made = scenario(f"trajectory.profile={profile}")
     demands, search = limited(made), search_of(made)
-    shown = made.model, made.ends, made.inputs.trajectory
+    shown = made.world.model, made.ends, made.world.inputs.trajectory
     plan = plan_task(*shown, demands, search)
     assert plan.feasible, plan.reason
-    seen = np.array([in_truth(made.truth, q) for q in plan.q])
+    seen = np.array([in_truth(made.simulated.truth, q) for q in plan.q])
     assert seen[:, 0, :2].min() < 0.0  # the face is not, all the way
     assert (seen[:, :, :2].min(axis=2).max(axis=1) > 0.0).all()
     assert plan.margin.min() > 0.0
@@ -96,8 +97,10 @@ def test_a_run_that_sees_another_tag_alone_for_a_while_arrives():
     """The face turns away, and is lost to both cameras besides; the body is measured by the others."""
     unseen = "disturbance.lost_markers={from_step: 10, steps: 30, markers: [0, 1, 2, 3]}"
     made = scenario("trajectory.profile=joint_space", "noise.servo_px=0.2", unseen, calibrated=True)
-    plan = plan_task(made.model, made.ends, made.inputs.trajectory, limited(made), search_of(made))
-    trace = drive(made, plan, "exact_track").trace()
+    plan = plan_task(
+        made.world.model, made.ends, made.world.inputs.trajectory, limited(made), search_of(made)
+    )
+    trace = trace_of(drive(made, plan, "exact_track"))
     assert np.isnan(trace.s[10:40, :, :4]).all()
     assert trace.verdict == "converged"
     assert trace.position_error_mm < 1.0

@@ -36,7 +36,7 @@ def case(name="paper", steps=SHORT, whole=False):
     """
     config = configured(name, f"stop.max_steps={steps}")
     scenario = known_scenario(config)
-    true = scenario.truth
+    true = scenario.simulated.truth
     model = stage.projective_twin(true.model)
     plan = planned(scenario, model, samples=21, duration=3.0)
     sense = plan.rotation_sense()
@@ -72,7 +72,7 @@ def case(name="paper", steps=SHORT, whole=False):
             numbers,
             traces,
             extra,
-            trajectory=scenario.inputs.trajectory,
+            trajectory=scenario.world.inputs.trajectory,
             metric=metric,
         ),
     )

@@ -14,7 +14,7 @@ class Case:
     def __init__(self, name, overrides=()):
         self.config = configured(name, *overrides)
         self.scenario = known_scenario(self.config)
-        self.truth, self.ends = self.scenario.truth, self.scenario.ends
+        self.truth, self.ends = self.scenario.simulated.truth, self.scenario.ends
         self.plant = self.scenario.plant_of("direct_three")
         self.gains, self.limits = self.scenario.gains, self.scenario.termination
         self.plan = self.planned(self.truth.model)

@@ -11,7 +11,7 @@ from projservo_cli.report.animation import motion_of
 from projservo_cli.report.figures.scene import features_in_space
 from projservo_cli.report.report_data import REGISTER, Driven
 from projservo_cli.simulation.workspace import plant_of
-from projservo_cli.stages.servo import PluginLaw
+from projservo_cli.stages.plugin_law import PluginLaw
 from tests.configured import calibrate, plan, servo, truth_of
 from tests.known import configured
 

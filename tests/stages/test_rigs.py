@@ -104,7 +104,7 @@ def test_a_plan_through_joint_space_keeps_what_it_asks_of_the_views(rig):
     config, calibration, _ = chain(rig)
     made = plan.run(rigged(rig, "trajectory.profile=joint_space"), calibration)
     assert made.feasible, made.reason
-    truth, least = truth_of(config), scenario_of(config, calibration).least_views
+    truth, least = truth_of(config), scenario_of(config, calibration).world.least_views
     for q in made.q:
         s = truth.images(q, truth.M_face)
         size = truth.image_size[:, None]

@@ -28,7 +28,7 @@ LEAST_FALL = 20  # steps in which an error that stands still falls by less than 
 def runs(config, *laws, **limits):
     """Traces of laws with the true model."""
     scenario = known_scenario(config)
-    model = scenario.truth.model
+    model = scenario.simulated.truth.model
     plan = planned(scenario, model)
     return [driven(scenario, plan, law, model, **limits) for law in laws]
 

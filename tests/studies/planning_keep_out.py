@@ -9,7 +9,7 @@ they are excluded.
 
 import sys
 from collections import Counter
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -27,8 +27,9 @@ from projservo_cli.settings.task import KeptOut
 from projservo_cli.simulation.arm import METRIC_A_INF
 from projservo_cli.simulation.random_tasks import random_tasks
 from projservo_cli.simulation.workspace import Truth
-from projservo_cli.stages.scenario import Scenario
+from projservo_cli.stages.run_trace import trace_of
 from projservo_cli.stages.servo import drive
+from projservo_cli.stages.worlds.simulated import SimulatedWorld
 from projservo_cli.task.target import TaskImages
 from tests.configured import calibrate, joints_of, plan, scenario_of, truth_of
 from tests.known import configured, with_task
@@ -185,14 +186,14 @@ def way_exists(config, truth: Truth, task: Drawn):
 
 
 @dataclass(frozen=True, eq=False)
-class Hiding(Scenario):
-    """A scenario in which markers are unseen at some instants (k, 2, markers)."""
+class Hiding(SimulatedWorld):
+    """A world in which markers are unseen at some instants (k, 2, markers)."""
 
     unseen: np.ndarray
 
-    def noise_of(self, law, seed, instants):
+    def noise(self, numbers, seed, times):
         """Noise as ever, NaN where the box hides a marker."""
-        noise = super().noise_of(law, seed, instants).copy()
+        noise = super().noise(numbers, seed, times).copy()
         noise[: len(self.unseen)][self.unseen] = np.nan
         return noise
 
@@ -204,8 +205,9 @@ def driven_behind(scenario, planned, truth: Truth, box: Box):
     columns = [[*truth.face, *truth.pins].index(i) for i in order]
     unseen = np.zeros((1, 2, len(markers)), dtype=bool)
     for _ in range(4):
-        parts = {field.name: getattr(scenario, field.name) for field in fields(Scenario)}
-        trace = drive(Hiding(**parts, unseen=unseen), planned, "exact_track").trace()
+        parts = {field.name: getattr(scenario.world, field.name) for field in fields(SimulatedWorld)}
+        hiding = replace(scenario, world=Hiding(**parts, unseen=unseen))
+        trace = trace_of(drive(hiding, planned, "exact_track"))
         behind = hidden(truth, box, trace.q)[:, :, columns]
         if behind.shape == unseen.shape and (behind == unseen).all():
             break

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from projservo_cli.stages.run_trace import trace_of
 from projservo_cli.stages.servo import drive
 from tests.configured import calibrate, plan, scenario_of, truth_of
 from tests.known import configured
@@ -22,8 +23,8 @@ def test_visp_by_two_cameras_goes_the_way_of_the_stacked_law():
     planned, scenario = plan.run(config, calibration), scenario_of(config, calibration)
     with visp.Program() as program:
         law = program.law("ibvs", visp.true_cell(truth_of(config)), (0, 1), 0.01)
-        run = drive(scenario, planned, "ViSP", factory=law).trace()
-    stacked = drive(scenario, planned, "stacked").trace()
+        run = trace_of(drive(scenario, planned, "ViSP", factory=law))
+    stacked = trace_of(drive(scenario, planned, "stacked"))
     assert run.verdict == stacked.verdict == "converged"
     assert run.position_error_mm < 0.1
     # Focal lengths of 1175 to 1190 px weigh the points otherwise.

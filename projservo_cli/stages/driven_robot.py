@@ -1,0 +1,94 @@
+"""A robot of the contract as the loop of a law drives it: with its monitors and what is known of it."""
+
+import math
+from functools import partial
+
+import numpy as np
+
+from projservo_cli.calibration.prediction import predict
+from projservo_cli.monitoring.image_monitor import ImageMonitor
+from projservo_cli.monitoring.innovation_tests import WINDOW
+from projservo_cli.records import Calibration, InputError, Plan
+from projservo_cli.robots.client import DrivenRobot, Known
+from projservo_cli.robots.contract import Robot
+from projservo_cli.robots.latency import DelayPrior
+from projservo_cli.robots.object_watch import ObjectWatch
+from projservo_cli.robots.session import Session
+from projservo_cli.settings.disturbance import EachView
+from projservo_cli.stages.scenario import RunScenario
+from projservo_cli.stages.stage_inputs import Contract
+from projservo_cli.task.displaced_object import images_by_motion
+
+# Minimum deviation of a delay and of single frames, s; width of a 95 % interval in deviations.
+_LEAST_JITTER_S, _INTERVAL = 0.002, 3.92
+
+
+def connected_robot(
+    scenario: RunScenario,
+    law: str,
+    session: Session,
+    given: Robot | None = None,
+    plan: Plan | None = None,
+) -> DrivenRobot:
+    """Return the robot, open, as the loop of a law sees it: with its truth, or with the calibrated model.
+
+    session : which it is opened in, unless it is.
+    given : an object of the contract instead of one of a class.
+    plan : of which the object is watched, if its goal is carried by one.
+    """
+    contract, world, plant = scenario.servo.contract, scenario.world, scenario.plant_of(law)
+    assert contract is not None
+    calibration, whole = world.calibration, scenario.plant_of("exact")
+    steered = world.opened(session, contract, scenario.exact.q_start, whole, given)
+    monitor = None
+    if not scenario.untested:
+        noise = scenario.servo.stop.innovation_threshold * scenario.world.noise_px
+        visible = np.flatnonzero(np.isin(calibration.marker, scenario.world.observed))
+        readings = scenario.termination.max_steps + 1 + WINDOW
+        monitor = ImageMonitor(calibration, noise, readings, visible, plant.image_size)
+    watch = None
+    if plan is not None and plan.s_object is not None and plan.object_marker is not None:
+        name, numbers = plan.object_name or "", plan.object_marker.tolist()
+        places = np.array([contract.driven.further.index(number) for number in numbers])
+        if name not in session.held.values():  # else it moves with the tool
+            sigma, by_motion = plan.sigma_object, images_by_motion(calibration, plan.s_object)
+            sigma = np.full(plan.s_object.shape[:2], np.nan) if sigma is None else sigma
+            watch = ObjectWatch(name, numbers, places, plan.s_object, sigma, by_motion)
+    session.at = watch if scenario.world.inputs.displaced is None else None
+    return DrivenRobot(steered, plant, _known_of(scenario, contract, calibration, law), monitor, watch)
+
+
+def _known_of(scenario: RunScenario, contract: Contract, calibration: Calibration, law: str) -> Known:
+    """Return the knowledge of a robot and its images before a law drives it."""
+    numbers = scenario.world.observed
+    return Known(
+        predicted=partial(predict, calibration),
+        visible=np.array([numbers.index(number) for number in scenario.numbers_of(law)]),
+        order=np.array([numbers.index(k) if k in numbers else -1 for k in calibration.marker.tolist()]),
+        sigma_px=scenario.world.noise_px,
+        sigma_scale=calibration.sigma_scale or 1.0,
+        sigma_q=scenario.world.joints.length_of(math.degrees(calibration.sigma_q or 0.0)),
+        delays=_delays_of(contract.time_offset_s, calibration),
+        timeout_s=contract.timeout_s,
+        max_force_n=scenario.servo.stop.max_force_n,
+    )
+
+
+def _delays_of(given: EachView | None, calibration: Calibration) -> DelayPrior:
+    """Return the prior of the delays of all views: given, calibrated, or wide."""
+    view = calibration.view
+    known = DelayPrior.unknown(len(view))
+    if calibration.time_offset_s is not None:
+        interval, jitter = calibration.time_offset_interval_s, calibration.time_offset_jitter_s
+        assert interval is not None
+        assert jitter is not None
+        sigma = np.maximum(np.ptp(interval, axis=1) / _INTERVAL, 0.5 * _LEAST_JITTER_S)
+        known = DelayPrior(calibration.time_offset_s.copy(), sigma, np.maximum(jitter, _LEAST_JITTER_S))
+    if given is not None:
+        if missing := [name for name in view if given.of(name) is None]:
+            raise InputError(
+                f"plant.time_offset_s: names no {', '.join(missing)}: give their numbers, or others"
+            )
+        mean = np.array([given.of(name) for name in view], float)
+        known = known._replace(mean=mean, sigma=np.zeros(len(view)))
+    return known

@@ -1,0 +1,278 @@
+"""The run of a law: made, and driven to its verdict."""
+
+import copy
+import math
+from collections.abc import Callable
+from contextlib import nullcontext
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import Any
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from projservo_cli import plugins
+from projservo_cli.control.law import ERRORS, MAX_PARTS
+from projservo_cli.findings import Finding
+from projservo_cli.geometry.mechanisms import in_span
+from projservo_cli.laws import CODES, INCIDENCES, REGULATE
+from projservo_cli.loop.compiled import Course, run_compiled
+from projservo_cli.loop.python import BuiltInLaw, LoopLaw, run_in_python
+from projservo_cli.loop.replanning import ExecutionMonitor
+from projservo_cli.loop.run_metrics import Ended, Summary, path_deviation, summarize
+from projservo_cli.loop.stall_monitor import StallMonitor
+from projservo_cli.loop.verdicts import (
+    CONVERGED,
+    FAULT_DETECTED,
+    OBJECT_MOVED,
+    VERDICT_NAMES,
+    Log,
+    new_log,
+)
+from projservo_cli.records import (
+    MM,
+    FloatArray,
+    InputError,
+    Model,
+    Plan,
+)
+from projservo_cli.results import ImageModel
+from projservo_cli.robots.client import DrivenRobot
+from projservo_cli.robots.session import Session
+from projservo_cli.simulation.analytic_plant import AnalyticPlant, Ends, Plant
+from projservo_cli.stages.driven_robot import connected_robot
+from projservo_cli.stages.motions import PathReplanner, search_of, why_closed
+from projservo_cli.stages.plugin_law import LawSetup, PluginLaw
+from projservo_cli.stages.scenario import RunScenario
+from projservo_cli.task.face import Task, center_of
+from projservo_cli.task.incidences import (
+    whole_pose,
+)
+from projservo_cli.task.target import TaskImages, followed
+from projservo_cli.words.table import Setup
+
+_RETREAT = 10  # periods by which an arm goes back where the object of its goal moves
+_NOT_DRIVEN: Any = None  # in place of what a run leaves
+
+
+@dataclass(eq=False)
+class LawRun:
+    """A run of a law: made, driven to its verdict, and summed up."""
+
+    scenario: RunScenario
+    plan: Plan | FloatArray  # of the task, or the joint motions (2, n) of its rotations where that is enough
+    law: str
+    mode: str = REGULATE  # law, mode: of the run
+    planned_s: float | None = None  # when the plan that it follows arrives, s
+    unplanned: str = ""  # why it goes without the plan that it was to follow
+    believed: Model | None = None  # robot and rig as the law has them; None for the default of its kind
+    factory: Callable[[Any], Any] | None = None  # makes the law of its setup; None for that of its name
+    robot: Any = None  # an object of the contract; None for that of the configuration
+    blind: bool = False  # whether a robot may move although cameras show no marker of the calibration
+    session: Session | None = None  # whose robot is driven; None for a connection of its own
+    # As it ended.
+    verdict: str = ""
+    why: Finding | None = None  # what held, disturbed or failed it, where something did
+    steps: int = 0  # commands sent
+    log: Log = _NOT_DRIVEN  # the recorded run, once it was driven
+    limited: float = 0.0  # how often visibility limited the translation
+    plant: Plant = _NOT_DRIVEN  # that was driven; of an external robot the calibrated model
+    replannings: tuple[Finding, ...] = ()
+    driven: DrivenRobot | None = None  # client of a robot of the contract
+    unseen: Finding | None = None  # cameras that showed nothing before the run, though they were compared
+    noise_ratio: float = 1.0  # of what pixels stated at the end to the noise of the run; at least 1
+    own_tolerance: float | None = None  # of an error that a law of somebody's states
+
+    @property
+    def own_unit(self) -> float:
+        """Factor of errors that decide convergence, in px, to what they are told in."""
+        own = self.own_tolerance
+        return 1.0 if own is None else own / self.scenario.termination.image_error_px
+
+    @property
+    def setup(self) -> Setup:
+        """Return the arm and the cameras for words."""
+        return self.scenario.world.setup
+
+    @property
+    def judged(self) -> tuple[str, str]:
+        """Name and unit of the error that decides convergence, as words have them."""
+        if self.own_tolerance is not None:
+            return "error of the law", ""
+        if self.scenario.exact.incidences and not math.isnan(float(self.log.fit[self.steps, 2])):
+            return "error of the incidences", "px"
+        return "image error", "px"
+
+    @property
+    def replans(self) -> bool:
+        """Whether the law goes its own way instead of following the plan."""
+        return self.mode == REGULATE or bool(self.unplanned)
+
+    @property
+    def is_guided(self) -> bool:
+        """Whether the run follows a plan which gives way to another one where it fails."""
+        scenario = self.scenario
+        searched = scenario.world.inputs.trajectory.profile in ("joint_space", "auto")
+        if self.replans or self.law not in CODES or not searched:
+            return False
+        return not why_closed(scenario.world.model, scenario.demands, search_of(scenario))
+
+    def simulated(self) -> tuple[Plant, FloatArray, FloatArray]:
+        """The simulated robot as the law sees it, its first joints (n,), and the noise of its images."""
+        scenario = self.scenario
+        numbers, times = scenario.numbers_of(self.law), scenario.termination.max_steps + 1
+        noise = scenario.simulated.noise(numbers, scenario.world.inputs.seed, times)
+        return scenario.plant_of(self.law), scenario.ends.q_start, noise
+
+    def compiled(self) -> None:
+        """Drive a built-in law on the simulated robot in the compiled loop."""
+        scenario, controller = self.scenario, self._built_in()
+        limits, observed = scenario.termination, len(scenario.numbers_of(self.law))
+        self.plant, q_start, noise = self.simulated()
+        parts = MAX_PARTS if scenario.gains.substeps else 0
+        V = len(scenario.world.view)
+        self.log = new_log(len(q_start), observed, limits.max_steps, len(ERRORS), parts, V)
+        course = Course(self.plant, limits, q_start.copy())
+        code, self.steps = run_compiled(controller.law, course, noise, controller.state, self.log)
+        self.verdict, self.limited = VERDICT_NAMES[code], float(controller.state.limited[0])
+
+    def by_contract(self) -> None:
+        """Drive a robot of the contract from the start of the task, where a simulated one stands.
+
+        That of ``plant.use`` is driven there, unless it starts where it stands. Before its first motion, its
+        images must agree with the calibration where it stands. The robot is stopped and closed on every way
+        out, in a shared session at its end.
+        """
+        scenario, contract = self.scenario, self.scenario.servo.contract
+        assert contract is not None
+        scenario.world.require_ready()
+        controller = self.controller()
+        shared, plan = self.session, self.plan if isinstance(self.plan, Plan) else None
+        # The matrices of a frame are small: a second thread costs more than it gives.
+        with threadpool_limits(limits=1), nullcontext(shared) if shared else Session() as session:
+            driven = connected_robot(scenario, self.law, session, self.robot, plan)
+            driven.stops = shared is None
+            self.unseen = scenario.world.begin(driven, contract, scenario.ends.q_start, blind=self.blind)
+            driven.begin()
+            driven.retreats = _RETREAT
+            self.in_python(controller, driven, StallMonitor(driven, scenario.termination))
+
+    def in_python(
+        self, law: LoopLaw, plant: AnalyticPlant | DrivenRobot, stall: StallMonitor | None = None
+    ) -> None:
+        """Drive a law on a plant, every command scaled; a run that is guided is watched."""
+        scenario, execution = self.scenario, None
+        if self.is_guided and isinstance(law, BuiltInLaw):
+            assert isinstance(self.plan, Plan)
+            follow, searches = partial(self._task, law.law.model), scenario.servo.max_replan_attempts
+            replanner = PathReplanner(scenario, self.plan)
+            blind, limits = self.blind or scenario.world.moves_unseen, scenario.termination
+            execution = ExecutionMonitor(law, follow, replanner, searches, limits, stall, blind=blind)
+        code, self.steps, self.log = run_in_python(
+            law,
+            plant,
+            scenario.ends.by_points().s_star,
+            scenario.gains.period,
+            scenario.termination,
+            scenario.servo.speed_scale,
+            stall=stall,
+            execution=execution,
+        )
+        self.noise_ratio = plant.noise_ratio
+        if isinstance(law, PluginLaw) and law.states_error:
+            self.own_tolerance = law.tolerance
+        if isinstance(plant, DrivenRobot):
+            self.driven = plant
+            if code == CONVERGED and plant.at_rest():
+                code = FAULT_DETECTED
+            if code == FAULT_DETECTED and plant.object_moved:
+                code = OBJECT_MOVED
+            # It moves from sample to sample, in any mode.
+            path = np.stack([self.log.q, np.roll(self.log.q, -1, axis=0)], axis=1)
+            self.log = self.log._replace(path=path, parts=np.ones_like(self.log.parts))
+        self.verdict, self.plant = VERDICT_NAMES[code], plant.plant
+        self.limited = float(law.state.limited[0]) if isinstance(law, BuiltInLaw) else 0.0
+        self.why = plant.disturbance or (None if stall is None else stall.reason)
+        self.replannings = () if execution is None else tuple(execution.attempts)
+
+    def _task(self, model: Model, plan: Plan) -> Task:
+        """The task as a built-in law with a model is given it, with the plan that it follows."""
+        scenario = self.scenario
+        task, scale = scenario.images_for(self.law).task(model), scenario.servo.speed_scale
+        return followed(model, task, plan, scenario.gains.period, scale)
+
+    def _images(self) -> TaskImages:
+        """Start and goal as the law measures them, with the whole pose for a law of incidences without any.
+
+        Raises InputError for such a law without a body.
+        """
+        images = self.scenario.images_for(self.law)
+        if self.law != INCIDENCES or images.incidences:
+            return images
+        if not len(images.body.M):
+            raise InputError(
+                f"{self.law} measures with the body: leave control.features: points out, and calibrate well"
+            )
+        return images._replace(incidences=whole_pose(images.body.M[: self.scenario.world.m]))
+
+    def _built_in(self) -> BuiltInLaw:
+        """The built-in law with the model that it is given, and the sense of its rotations."""
+        scenario, plan = self.scenario, self.plan
+        model = self.believed or scenario.believed_by(self.law)
+        if self.replans:
+            task = self._images().task(model)
+        else:
+            assert isinstance(plan, Plan)
+            task = self._task(model, plan)
+        found = BuiltInLaw(CODES[self.law], model, task, scenario.gains)
+        sense = plan.rotation_sense() if isinstance(plan, Plan) else plan
+        found.state.driven[:] = in_span(found.state.work.span, model, scenario.ends.q_start, sense)
+        return found
+
+    def controller(self) -> LoopLaw:
+        """The law, ready for the Python loop.
+
+        Raises InputError if there is no such law, it needs a model of the robot that the configuration lacks,
+        or the plan to follow has no time; WorkFailed if it cannot be made, or the joints cannot follow the
+        plan.
+        """
+        if self.law in CODES:
+            return self._built_in()
+        scenario, gains, ends = self.scenario, self.scenario.gains, self.scenario.ends.by_points()
+        assert isinstance(self.plan, Plan)
+        face = np.array(scenario.world.calibration.indices_of(scenario.world.numbers[: scenario.world.m]))
+        model, shown = ImageModel.of(scenario.world.calibration), (ends.s_start, ends.s_star)
+        # A copy: no law may write to the arrays of another.
+        setup = copy.deepcopy(LawSetup(model, face, *shown, self.plan, gains, gains.period))
+        factory = self.factory or plugins.find("law", self.law)
+        law = plugins.called("law", self.law, factory, (setup,), {})
+        return PluginLaw(
+            law, f"law {self.law}", scenario.world.least_views, scenario.termination.image_error_px
+        )
+
+    @cached_property
+    def summary(self) -> Summary:
+        """Numbers of the run; NaN if they need an unknown truth."""
+        ended = Ended(VERDICT_NAMES.index(self.verdict), self.steps, self.limited)
+        found = summarize(self.plant, self.log, ended, self.scenario.gains.period, self.true_ends)
+        return self.scenario.world.judged(found)
+
+    @property
+    def self_occluded_steps(self) -> tuple[int, ...]:
+        """Number of times (V,) at which each camera is behind the face."""
+        return tuple(np.count_nonzero(self.log.hidden[: self.steps + 1], axis=0).tolist())
+
+    def deviation_mm(self) -> float:
+        """Largest distance of the true centre from its line, between the samples too, mm; NaN if unknown."""
+        goal, period = self.true_ends.goal, self.scenario.gains.period
+        if not np.isfinite(goal).all():
+            return math.nan
+        start = self.log.H[0] @ np.array(center_of(self.plant.M, self.plant.center))
+        between = path_deviation(self.plant, self.log, self.steps, period, start, goal)
+        return max(MM * between, self.summary.center_deviation_at_samples_mm)
+
+    @cached_property
+    def true_ends(self) -> Ends:
+        """True poses of the tool, with the nearest goal to where it ended where incidences leave it open."""
+        scenario, H = self.scenario, self.log.H[self.steps]
+        return scenario.world.nearest_ends(scenario.exact, scenario.true_ends, self.plant, H)

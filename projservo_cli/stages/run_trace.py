@@ -1,0 +1,332 @@
+"""The record of a run: its numbers and series, how far it ended from its goal, and why."""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import fields, replace
+from typing import Any
+
+import numpy as np
+
+from projservo_cli.control.law import TAU_AFFINE, THETA_S
+from projservo_cli.findings import LIMITS, NOTE, REFUSES, Finding, Subject
+from projservo_cli.geometry.algebra import as_array
+from projservo_cli.geometry.kernels import COORDINATES
+from projservo_cli.geometry.kinematics import forward
+from projservo_cli.geometry.lens import undistort
+from projservo_cli.laws import REGULATE
+from projservo_cli.loop.run_metrics import Summary
+from projservo_cli.loop.verdicts import (
+    PLATEAU_FALL,
+    Log,
+    plateau_stretch,
+    tolerance,
+)
+from projservo_cli.monitoring.accuracy import Posture, metres_a_unit, rigid_fit
+from projservo_cli.monitoring.innovation_tests import WINDOW
+from projservo_cli.records import (
+    MM,
+    BoolArray,
+    FloatArray,
+    Plan,
+    Trace,
+)
+from projservo_cli.simulation.analytic_plant import rig_distance
+from projservo_cli.simulation.faults import obstruction_of
+from projservo_cli.stages.law_run import LawRun
+from projservo_cli.task.body import SETTLED, fit_body
+from projservo_cli.task.incidences import (
+    errors_px,
+    images_of,
+    metric_errors,
+)
+from projservo_cli.words import text
+from projservo_cli.words.reasons import VERDICTS, arrived
+
+# Maximum residual of a body that agrees with its calibration, over the noise, px.
+_AGREES, _LEAST_NOISE_PX = 4.0, 0.01
+# Image error of a face of three markers as it is seen, over that which counts as converged: by noise once in
+# ten thousand.
+_BY_NOISE = 2.0
+# Noise of markers at the end, over that of the run, that is told.
+_VAGUE = 3.0
+# Joints that moved by less in the steps in which an error must fall hardly did, rad or m.
+_HARDLY = 0.01
+
+
+def trace_of(run: LawRun) -> Trace:
+    """Record of a run that was driven."""
+    scenario, log, steps = run.scenario, run.log, run.steps
+    rows = steps + 1
+    before, after, views = log.fit[:rows].T
+    errors, H, read = log.errors[:rows], log.H[:rows], log.read[:rows]
+    # A law that follows a plan measures the distance to the plan, not to the goal.
+    remaining = _left(log, steps) if run.mode == REGULATE else (None, None)
+    joint = int(log.events[2])
+    stretch = plateau_stretch(log.judged[:rows], scenario.termination.stall_periods)
+    s_star = scenario.ends.by_points().s_star
+    driven = run.driven
+    dark = _blind_view(log.s[:rows], scenario.world.view, WINDOW) if driven and arrived(run.verdict) else ()
+    lost = [run.unseen] if run.unseen else dark
+    untested = () if driven is None else scenario.untested
+    found = (*_reason(run, joint, remaining), *run.replannings)
+    if driven is not None:  # the log has the predicted rest of the robot instead of readings
+        read = _whole(driven.readings, rows)
+    values = run.summary._asdict() | {"center_deviation_mm": run.deviation_mm()}
+    told = None if driven is None or not driven.truths else _whole(driven.truths, rows)
+    poses = scenario.world.poses(run.plant, run.true_ends, H, told, scenario.joints_at_goal)
+    values |= poses.numbers
+    numbers: dict[str, Any] = {n: None if math.isnan(values[n]) else values[n] for n in _SUMMARY_FIELDS}
+    if numbers["success"] is not None:
+        numbers["success"] = numbers["success"] == 1.0
+    return Trace(
+        **numbers,
+        view=scenario.world.view,
+        self_occluded_steps=run.self_occluded_steps,
+        law=run.law,
+        mode=run.mode,
+        planned_s=run.planned_s,
+        verdict=run.verdict,
+        reason=text(found, run.setup),
+        findings=found,
+        replan_attempts=len(run.replannings),
+        steps=steps,
+        period=scenario.gains.period,
+        features="points" if np.isnan(views).all() else "body",
+        remaining_translation=remaining[0],
+        remaining_rotation_deg=remaining[1],
+        longest_stall_steps=0 if stretch is None else stretch[1] - stretch[0],
+        limit_joint=joint,
+        q=log.q[:rows],
+        q_read=None if np.array_equal(read, log.q[:rows]) else read,
+        s=np.ascontiguousarray(log.s[:rows, :, : s_star.shape[1]]),
+        s_star=s_star,
+        image_error=log.error[:rows],
+        convergence_error=run.own_unit * log.judged[:rows],
+        tau=errors[:, 0],
+        tau_affine=errors[:, 1],
+        theta_r=errors[:, 2],
+        theta_p=errors[:, 3],
+        theta_s=errors[:, 4],
+        prediction_px=_rms(before, 2.0 * views),
+        fit_px=_rms(after, 2.0 * views - COORDINATES),
+        views_used=views,
+        q_dot=log.q_dot[:steps],
+        speed_factor=log.factor[:steps],
+        self_occluded=log.hidden[:rows] > 0.5,
+        pose=poses.pose,
+        goal_pose=poses.goal_pose,
+        center=poses.center,
+        unplanned=run.unplanned,
+        **_incidences(run),
+        **_stated_mm(run, views),
+        untested=text((*untested, *lost), run.setup),
+        overruns=None if driven is None else driven.steered.overruns,
+        force=None if driven is None or not driven.forces else _whole(driven.forces, rows),
+        latency=None if driven is None else _whole(driven.delays, rows),
+        **({} if driven is None else driven.film.fields()),
+    )
+
+
+# Numbers of a trace that are those of the summary of its run, and one more.
+_SUMMARY_FIELDS = [
+    field.name for field in fields(Trace) if field.name in {*Summary._fields, "center_deviation_mm"}
+]
+
+
+def _whole(values: Sequence[FloatArray] | Sequence[float], rows: int) -> FloatArray:
+    """Return the values at each time of a run, (rows, ...); NaN after its end."""
+    missing = np.full_like(values[0], np.nan)
+    return np.array([*values, *[missing] * (rows - len(values))])
+
+
+def _stated_mm(run: LawRun, views: FloatArray) -> dict[str, Any]:
+    """State how far the face ended from the goal, rms mm: by images, and by what no test tells from none.
+
+    Nothing if no length on the face is known, or images disagree with the calibration.
+    """
+    scenario, calibration, m = run.scenario, run.scenario.world.calibration, run.scenario.world.m
+    if scenario.exact.incidences:  # from one goal of many
+        return {}
+    noise = [_LEAST_NOISE_PX, scenario.world.noise_px, calibration.sigma_px]
+    left = _rms(run.log.fit[run.steps, 1:2], 2.0 * views[-1:] - COORDINATES)[0]
+    untested = run.driven is not None and scenario.untested
+    ended = VERDICTS[run.verdict]
+    if ended.refutes or ended.retried or untested or left > _AGREES * max(noise):
+        return {}
+    numbers, q = scenario.numbers_of(run.law), run.log.read[run.steps]
+    M = calibration.M[calibration.indices_of(numbers)]
+    s, s_star = run.log.s[run.steps], scenario.images_for(run.law).s_star
+    posture = Posture(scenario.world.model, q, M[:m], scenario.world.inputs.lengths)
+    whole = np.isfinite(s[:, :m]).all(axis=(1, 2))
+    if not posture.known or whole.sum() < scenario.world.least_views:
+        return {}
+    used: BoolArray = np.isfinite(s + s_star)[..., 0]
+    off = np.where(used[..., None], s - s_star, 0.0).ravel()
+    # By all markers that the law measures with, and by the face itself.
+    measured = (used, used & (np.arange(len(numbers)) < m))
+    parts, found = [max(float(np.linalg.norm(posture.carry(M, by) @ off)) for by in measured)], {}
+    if run.driven is not None and run.driven.monitor is not None:
+        every = np.zeros((len(scenario.world.view), len(calibration.marker)), dtype=np.bool_)
+        every[:, calibration.indices_of(numbers)] = used
+        found["undetected_position_error_mm"] = run.driven.monitor.undetected_mm(q, every, posture)
+    if isinstance(run.plan, Plan) and run.plan.object_name is not None:
+        parts.append(run.plan.goal_deviation_mm or 0.0)
+    elif (goal := scenario.goal_pixels) is not None:
+        parts.append(rigid_fit(calibration, q, *goal).off_mm(posture, calibration.M))
+    return found | {"estimated_position_error_mm": float(np.linalg.norm([*parts, *found.values()]))}
+
+
+def _left(log: Log, steps: int) -> tuple[float | None, float | None]:
+    """Share of the translation and rotation, deg, that were left; None where the law measures neither."""
+    first, last = (float(log.errors[k, TAU_AFFINE]) for k in (0, steps))
+    turn = float(log.errors[steps, THETA_S])
+    share = last / first if first > 0.0 and math.isfinite(last) else None
+    return share, math.degrees(turn) if math.isfinite(turn) else None
+
+
+def _rms(squares: FloatArray, count: FloatArray) -> FloatArray:
+    """Root of the mean of sums of squares; NaN where the count is not positive."""
+    mean = np.full(squares.shape, math.nan)
+    np.divide(squares, count, out=mean, where=count > 0.0)
+    return np.asarray(np.sqrt(mean))
+
+
+def _incidences(run: LawRun) -> dict[str, Any]:
+    """Names of the incidences, their errors at each time, px, and the freedoms that they leave."""
+    scenario, images = run.scenario, run.scenario.ends
+    if not images.incidences:
+        return {}
+    task, model = images.task(scenario.world.model), scenario.world.model
+    seen, normal = undistort(model.lens, run.log.s), np.zeros((COORDINATES, COORDINATES + 1))
+    H = np.full((run.steps + 1, 4, 4), math.nan)  # measured, as far as images show it
+    for k in range(len(H)):
+        fit = fit_body(model.P, task.body, seen[k], forward(model, run.log.read[k]), SETTLED, normal)
+        if fit.settled:
+            H[k] = as_array(fit.H)
+    taught = images.displacement_taught(model)
+    mm, deg = metric_errors(model, images.incidences, task.body.M, (H[-1], taught))
+    flats = [[one.tool for one in images.incidences], [one.scene for one in images.incidences]]
+    metre = metres_a_unit(model, task.body.M[: scenario.world.m], scenario.world.inputs.lengths)
+    return {
+        "feature_s": images_of(model, task.body.M, flats[0], H),
+        "feature_s_star": images_of(model, task.body.M, flats[1], taught[None])[0],
+        "incidence_mm": MM * mm * metre,
+        "incidence_deg": deg,
+        "incidences": tuple(one.name for one in images.incidences),
+        "incidence_px": errors_px(task.incidences, H),
+        "free_dof": run.plan.free_dof if isinstance(run.plan, Plan) else None,
+    }
+
+
+def _stalled_by(run: LawRun) -> Finding:
+    """Return why the image error stopped falling: commands too slow to lower it, or a local minimum.
+
+    Joints that move on at their limits, as a law asks of them near a singularity, are not slow.
+    """
+    gains, window = run.scenario.gains, run.scenario.termination.stall_periods
+    minimum = Finding("local_minimum", LIMITS)
+    if run.steps < window:
+        return minimum
+    limited = float(np.median(run.log.factor[run.steps - window : run.steps]))
+    share = min(1.0, max(gains.gain, gains.gain_s) * gains.period * gains.scale * limited)
+    moved = np.abs(np.diff(run.log.read[run.steps - window : run.steps + 1], axis=0)).sum(axis=0).max()
+    if 1.0 - (1.0 - share) ** window > 2.0 * PLATEAU_FALL or moved > _HARDLY:
+        return minimum
+    return Finding("slow_commands", LIMITS, amount=share)
+
+
+def _reason(run: LawRun, joint: int, remaining: tuple[float | None, float | None]) -> Iterator[Finding]:
+    """Yield the reasons of the verdict."""
+    log, steps, limits, verdict = run.log, run.steps, run.scenario.termination, run.verdict
+    name, unit = run.judged
+    error, within = (
+        run.own_unit * value
+        for value in (float(log.judged[steps]), tolerance(limits, float(log.fit[steps, 2]), run.noise_ratio))
+    )
+    own = Finding(
+        verdict.replace(" ", "_"), REFUSES, Subject(name=name, joints=(joint + 1,)), error, unit=unit
+    )
+    at_step = replace(own, amount=float(steps), unit="1")
+    if verdict == "converged":
+        yield replace(own, severity=NOTE, limit=within)
+        yield from (*_vague(run), *_apart(run), *_unkept(run, at_step))
+        return
+    if verdict == "no progress":
+        yield replace(own, others=(run.why or _stalled_by(run),))
+    elif verdict == "markers lost":
+        unseen = Finding("marker_unseen", amount=limits.max_lost_periods, unit="1")
+        yield replace(at_step, others=(run.why or unseen,))
+    elif verdict == "diverged":
+        yield _grown(run, own, at_step)
+    elif verdict == "joint limit":
+        unit = "m" if run.scenario.world.model.prismatic[joint] else "rad"
+        yield replace(own, amount=float(log.read[steps, joint]), unit=unit)
+    elif run.why is not None:
+        yield run.why
+    else:
+        yield own if verdict == "max steps" else at_step
+    if verdict in ("following error", "joint limit"):
+        share, turn = remaining
+        parts = [] if share is None else [Finding("share", amount=share, unit="1")]
+        parts += [] if turn is None else [Finding("turn", amount=math.radians(turn), unit="rad")]
+        yield replace(own, code="remaining", others=tuple(parts))
+    yield from _blind_view(log.s[: steps + 1], run.scenario.world.view, limits.stall_periods)
+    if run.driven is not None:
+        yield from obstruction_of(run.driven.robot.robot)
+
+
+def _grown(run: LawRun, own: Finding, at_step: Finding) -> Finding:
+    """Return which of error, distance and command made a run diverge."""
+    log, more = run.log, run.scenario.termination.diverged_factor
+    times, first = (Finding("factor", amount=more),), run.own_unit * float(log.judged[0])
+    at, begun = rig_distance(run.plant, run.plant.M @ log.H[run.steps].T), float(log.begun[0])
+    if log.judged[run.steps] > more * log.begun[1]:
+        return replace(own, code="error_grew", limit=first, others=times)
+    if at > more * begun > 0.0:
+        return replace(own, code="face_left", amount=at, limit=begun, unit="m", others=times)
+    return replace(at_step, code="not_finite")
+
+
+def _vague(run: LawRun) -> Iterator[Finding]:
+    """Tell that markers are seen there with more noise than elsewhere."""
+    if run.noise_ratio > _VAGUE:
+        yield Finding("vague_markers", LIMITS, amount=run.noise_ratio, limit=_VAGUE)
+
+
+def _apart(run: LawRun) -> Iterator[Finding]:
+    """Tell that the face as it is seen is off by more than noise, though the whole body is not."""
+    displaced = run.scenario.world.inputs.displaced  # to where it was never seen
+    if run.scenario.exact.incidences or displaced:  # the face may be anywhere that they leave open
+        return
+    limits = run.scenario.termination
+    by_noise = limits.image_error_px + (run.noise_ratio - 1.0) * limits.noise_px
+    seen, most = float(run.log.error[run.steps]), _BY_NOISE * by_noise
+    if seen > most:
+        yield Finding("face_apart", LIMITS, amount=seen, limit=most, unit="px")
+
+
+def _unkept(run: LawRun, at_step: Finding) -> Iterator[Finding]:
+    """Tell which constraint a simulated run did not keep in truth, so that it is no success."""
+    summary, hidden = run.summary, run.self_occluded_steps
+    if summary.success != 0.0:
+        return
+    found = replace(at_step, severity=LIMITS)
+    if summary.first_outside_image >= 0:
+        yield replace(found, code="out_of_view", amount=float(summary.first_outside_image))
+    if (step := summary.first_beyond_limit) >= 0:
+        q, limits = run.log.q[step], run.plant.limits
+        joint = int(np.argmax(np.maximum(limits.lower - q, q - limits.upper)))
+        yield replace(found, code="joint_passed", subject=Subject(joints=(joint + 1,)), amount=float(step))
+    for name, steps in zip(run.scenario.world.view, hidden, strict=True):
+        if steps:
+            yield replace(found, code="face_hidden", subject=Subject(views=(name,)), amount=float(steps))
+
+
+def _blind_view(s: FloatArray, names: Sequence[str], window: int) -> Sequence[Finding]:
+    """Return the camera that showed no marker in the last images (k, V, m, 2), and since when."""
+    for view, name in enumerate(names):
+        steps = np.flatnonzero(np.isfinite(s[:, view, :, 0]).any(axis=1))
+        last = int(steps[-1]) if steps.size else -1
+        if len(s) - last > window:
+            return (Finding("blind_camera", LIMITS, Subject(views=(name,)), last + 1.0, unit="1"),)
+    return ()

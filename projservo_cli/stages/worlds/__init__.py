@@ -1,0 +1,5 @@
+"""Worlds that plans and runs are made in: simulated ones, whose truth is known, and a calibrated one.
+
+A world shows start and goal of a task and objects, drives its robot, and tells how a run ended, as far as it
+knows. Plans and laws are given its calibration; what is true stays inside a simulated one.
+"""
