@@ -1001,14 +1001,20 @@ class RunHistory:
     incidence_mm: FloatArray | None = _optional_array(
         "incidence",
         "mm",
-        "distance of features that are to meet, at the end by the images; NaN without a known length, or of "
-        "others",
+        "distance of features that are to meet, at the end, as stated: that which images show and its "
+        "deviation, root of the sum of squares; NaN without a known length, or of others",
     )
     incidence_deg: FloatArray | None = _optional_array(
         "incidence",
         "deg",
-        "angle that an incidence is off at the end by the images; NaN of points, or where the joints leave "
-        "angles open",
+        "angle that an incidence is off at the end, as stated likewise; NaN of points, or where the joints "
+        "leave angles open",
+    )
+    incidence_deviation_mm: FloatArray | None = _optional_array(
+        "incidence", "mm", "deviation of the distance by images, calibration and object"
+    )
+    incidence_deviation_deg: FloatArray | None = _optional_array(
+        "incidence", "deg", "deviation of the angle by images, calibration and object"
     )
     force: FloatArray | None = _optional_array(
         "time", "N", "force on the tool; none without stop.max_force_n"

@@ -393,10 +393,11 @@ def _of_laws(value: dict[str, Any], _: bool) -> Iterator[str]:
 
 
 def _incidence(row: dict[str, Any]) -> str:
-    """Name of an incidence, and how far it is off at the end by the images."""
-    parts = ((row["error_mm"], "mm"), (row["error_deg"], "deg"), (row["error_px"], "px"))
+    """Name of an incidence, within which error it is met, and by how much its images are off."""
+    parts = ((row["error_mm"], "mm"), (row["error_deg"], "deg"))
     said = [f"{number:.2g} {unit}" for number, unit in parts if number is not None and number == number]
-    return f"{row['name']} {', '.join(said)}"
+    within = f"within {', '.join(said)}, " if said else ""
+    return f"{row['name']} {within}{row['error_px']:.2g} px as seen"
 
 
 def _of_report(value: dict[str, Any], detailed: bool) -> Iterator[str]:

@@ -397,11 +397,15 @@ def _laws(run: Run, laws: Sequence[str]) -> dict[str, Any]:
 def _law(trace: Trace) -> dict[str, Any]:
     """Plain values of the run of a law, with the errors of its incidences at the end."""
     values = scalars_of(trace)
-    if trace.incidence_px is None or trace.incidence_mm is None or trace.incidence_deg is None:
+    if trace.incidence_px is None:
         return values
-    left = (trace.incidence_px[-1], trace.incidence_mm, trace.incidence_deg)
-    rows = zip(trace.incidences, *(errors.tolist() for errors in left), strict=True)
-    keys = ("name", "error_px", "error_mm", "error_deg")
+    units = "mm", "deg", "deviation_mm", "deviation_deg"
+    left = [getattr(trace, f"incidence_{unit}") for unit in units]
+    known = [np.full(len(trace.incidences), np.nan) if errors is None else errors for errors in left]
+    rows = zip(
+        trace.incidences, trace.incidence_px[-1].tolist(), *(one.tolist() for one in known), strict=True
+    )
+    keys = ("name", "error_px", "error_mm", "error_deg", "deviation_mm", "deviation_deg")
     return values | {"incidences": [dict(zip(keys, row, strict=True)) for row in rows]}
 
 

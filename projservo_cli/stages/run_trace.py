@@ -21,10 +21,9 @@ from projservo_cli.loop.verdicts import (
     plateau_stretch,
     tolerance,
 )
-from projservo_cli.monitoring.accuracy import Posture, metres_a_unit, rigid_fit
+from projservo_cli.monitoring.accuracy import Posture, rigid_fit
 from projservo_cli.monitoring.innovation_tests import WINDOW
 from projservo_cli.records import (
-    MM,
     BoolArray,
     FloatArray,
     Plan,
@@ -34,16 +33,19 @@ from projservo_cli.simulation.analytic_plant import rig_distance
 from projservo_cli.simulation.faults import obstruction_of
 from projservo_cli.stages.law_run import LawRun
 from projservo_cli.task.body import SETTLED, fit_body
+from projservo_cli.task.incidence_errors import Ends, IncidenceErrors, errors_of
 from projservo_cli.task.incidences import (
     errors_px,
     images_of,
-    metric_errors,
 )
+from projservo_cli.task.look_bundle import Look
+from projservo_cli.task.target import TaskImages
 from projservo_cli.words import text
 from projservo_cli.words.reasons import VERDICTS, arrived
 
 # Maximum residual of a body that agrees with its calibration, over the noise, px.
 _AGREES, _LEAST_NOISE_PX = 4.0, 0.01
+_EXACT_PX = 1e-3  # deviation of images that are predicted, or without noise
 # Image error of a face of three markers as it is seen, over that which counts as converged: by noise once in
 # ten thousand.
 _BY_NOISE = 2.0
@@ -204,18 +206,34 @@ def _incidences(run: LawRun) -> dict[str, Any]:
         if fit.settled:
             H[k] = as_array(fit.H)
     taught = images.displacement_taught(model)
-    mm, deg = metric_errors(model, images.incidences, task.body.M, (H[-1], taught))
+    left = _incidence_errors(run, images, H[-1], taught)
     flats = [[one.tool for one in images.incidences], [one.scene for one in images.incidences]]
-    metre = metres_a_unit(model, task.body.M[: scenario.world.m], scenario.world.inputs.lengths)
     return {
         "feature_s": images_of(model, task.body.M, flats[0], H),
         "feature_s_star": images_of(model, task.body.M, flats[1], taught[None])[0],
-        "incidence_mm": MM * mm * metre,
-        "incidence_deg": deg,
+        "incidence_mm": np.hypot(left.mm, left.deviation_mm),
+        "incidence_deg": np.hypot(left.deg, left.deviation_deg),
+        "incidence_deviation_mm": left.deviation_mm,
+        "incidence_deviation_deg": left.deviation_deg,
         "incidences": tuple(one.name for one in images.incidences),
         "incidence_px": errors_px(task.incidences, H),
         "free_dof": run.plan.free_dof if isinstance(run.plan, Plan) else None,
     }
+
+
+def _incidence_errors(
+    run: LawRun, images: TaskImages, H: FloatArray, H_taught: FloatArray
+) -> IncidenceErrors:
+    """State how far incidences are off at the end, where the body is displaced by H (4, 4)."""
+    scenario, world, plan = run.scenario, run.scenario.world, run.plan
+    s, carried = run.log.s[run.steps], plan if isinstance(plan, Plan) and plan.object_name else None
+    # The images of a goal that was carried along are predicted: its deviation is stated besides.
+    noise_px = (0.0 if carried else scenario.goal_sigma_px), world.noise_px
+    of_goal, now = (np.full(s.shape[:2], max(px, _EXACT_PX)) for px in noise_px)
+    more = (carried.goal_deviation_mm or 0.0, carried.goal_deviation_deg or 0.0) if carried else ()
+    ends = Ends(Look(images.taught().s_star, of_goal), Look(s, now), H_taught, H, *more)
+    markers = world.calibration.indices_of(world.numbers)
+    return errors_of(world.calibration, markers, images.incidences, ends, world.inputs.lengths)
 
 
 def _stalled_by(run: LawRun) -> Finding:

@@ -42,8 +42,6 @@ from projservo_cli.task.body import Body
 
 # Variance of a combination of errors, of unit variance each, below which it depends on the others.
 _DEPENDENT = 1e-9
-# Angle between features, deg, by their relation.
-_WANTED = {MEET: 0.0, PARALLEL: 0.0, PERPENDICULAR: 90.0}
 # Newton steps to a displacement at which all incidences hold: how many, the largest turn of one, rad, and the
 # last, over unit motions; singular value over the largest that counts as zero.
 _STEPS, _STRIDE, _SETTLED, _SINGULAR = 50, 0.5, 1e-12, 1e-9
@@ -492,46 +490,6 @@ def turned_about(body: Body, H: FloatArray) -> FloatArray:
 def image_error_at(incidences: Incidences, H: FloatArray) -> float:
     """Error of ``image_error`` at the displacement H (4, 4), px."""
     return float(image_error(incidences, mat(H), mat(np.asarray(np.linalg.inv(H), dtype=np.float64))))
-
-
-def metric_errors(
-    model: Model, asked: Sequence[Incidence], M: FloatArray, H: tuple[FloatArray, FloatArray]
-) -> tuple[FloatArray, FloatArray]:
-    """Distances (g,) of features that are to meet, in a metric up to scale, and angles (g,) off, deg.
-
-    M : (m, 4) markers of the body; H : displacements (4, 4) of it now, and where the goal was taught.
-    NaN for what an incidence has not, where the joints leave the metric open, and of a displacement of NaN.
-    """
-    apart, off = np.full((2, len(asked)), math.nan)
-    if not np.isfinite(H).all():
-        return apart, off
-    try:
-        S = invariant_upgrade(model.H_hat_0, model.prismatic)
-    except InputError:
-        return apart, off
-    for k, one in enumerate(asked):
-        tool, scene = (
-            (X := points_of(M, flat) @ (S @ where).T)[:, :3] / X[:, 3:]
-            for flat, where in zip((one.tool, one.scene), H, strict=True)
-        )
-        if one.relation == MEET:
-            small, large = (tool, scene) if len(tool) <= len(scene) else (scene, tool)
-            across = null_space(_directions(large)) if len(large) > 1 else np.eye(3)
-            apart[k] = np.linalg.norm((small - large[0]) @ across, axis=1).max()
-        if min(len(tool), len(scene)) > 1:
-            off[k] = abs(_angle(tool, scene) - _WANTED.get(one.relation, one.angle_deg))
-    return apart, off
-
-
-def _angle(tool: FloatArray, scene: FloatArray) -> float:
-    """Angle, deg, between lines or planes through metric points (k, 3); in their sense if both are alike."""
-    axes = [
-        points[1] - points[0] if len(points) == 2 else np.cross(*_directions(points))
-        for points in (tool, scene)
-    ]
-    cosine = float(axes[0] @ axes[1] / np.prod([np.linalg.norm(axis) for axis in axes]))
-    between = math.degrees(math.acos(min(1.0, max(-1.0, cosine))))
-    return between if len(tool) == len(scene) else abs(90.0 - between)
 
 
 def errors_px(incidences: Incidences, H: FloatArray) -> FloatArray:

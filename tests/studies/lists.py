@@ -16,7 +16,7 @@ from tests.configured import plan
 from tests.studies.common import in_two_processes, jobs_of, parser_of, rate, write_rows
 
 # Markers of a point, of another one, of a line through the first, and of a plane off it.
-MARKERS = {"ur5": (8, 9, 4, (5, 7, 9)), "hobby": (4, 5, 6, (5, 6, 7))}
+MARKERS = {"paper": (8, 9, 4, (5, 7, 9)), "ur5": (8, 9, 4, (5, 7, 9)), "hobby": (4, 5, 6, (5, 6, 7))}
 CONTRADICTORY = {
     "angles of lines": (("line", "line", "a"), ("line", "line", "b")),
     "angles of planes": (("plane", "plane", "a"), ("plane", "plane", "b")),
@@ -81,7 +81,9 @@ def planned(job):
 def main():
     """Plan all tasks and print how many were refused, and as what."""
     numbers = [("tasks", 300, "of each kind and arm")]
-    given = parser_of("lists_study", __doc__, numbers, arms=[*MARKERS], kinds=KINDS).parse_args()
+    given = parser_of(
+        "lists_study", __doc__, numbers, arms=(MARKERS, ["ur5", "hobby"]), kinds=KINDS
+    ).parse_args()
     jobs = list(jobs_of(given.arms, given.tasks, given.kinds))
     rows = []
     for mine in in_two_processes(planned, jobs, "tasks"):

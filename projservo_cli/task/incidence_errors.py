@@ -1,0 +1,201 @@
+"""How far features are from where incidences want them, and how far that may be off, in mm and degrees.
+
+Errors are those of the images of both poses and of the calibration, to first order; where the calibration is
+off, both poses and all features are off alike, and what they have in common drops out.
+"""
+
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import expm
+
+from projservo_cli.geometry.displacements import generators
+from projservo_cli.metric.frame import changes_of
+from projservo_cli.records import MEET, MM, PARALLEL, PERPENDICULAR, Calibration, FloatArray, WorkFailed
+from projservo_cli.task.incidences import Incidence
+from projservo_cli.task.look_bundle import BundleFit, Look, LookRig
+
+# Angle between features, rad, by their relation.
+_WANTED = {MEET: 0.0, PARALLEL: 0.0, PERPENDICULAR: 0.5 * np.pi}
+# Step of the differences by motions of the tool, units and rad.
+_STEP = 1e-5
+
+
+class Separation(NamedTuple):
+    """Vectors between features as they are and as an incidence wants them (...), in a metric frame.
+
+    Each vanishes with the error, and changes smoothly with the features.
+    """
+
+    apart: (
+        FloatArray  # (..., p, 3) between each point of the smaller feature and the other one; p is 0 if free
+    )
+    turned: (
+        FloatArray  # (..., 1 or 3) sine of the angle about each axis, or the angle, rad; 0 columns of points
+    )
+
+    @classmethod
+    def of(cls, one: Incidence, tool: FloatArray, scene: FloatArray) -> "Separation":
+        """Points (..., k, 3) span the features, one, two or three each."""
+        small, large = (tool, scene) if tool.shape[-2] <= scene.shape[-2] else (scene, tool)
+        apart = small - large[..., :1, :]
+        if large.shape[-2] > 1:
+            D = large[..., 1:, :] - large[..., :1, :]
+            apart = apart - apart @ np.linalg.pinv(D) @ D
+        if one.relation != MEET:
+            apart = apart[..., :0, :]
+        if small.shape[-2] == 1:
+            return cls(apart, np.zeros((*apart.shape[:-2], 0)))
+        a, b = (_axis(points) for points in (small, large))
+        along, wanted = (a * b).sum(axis=-1, keepdims=True), _wanted(one)
+        alike = small.shape[-2] == large.shape[-2]
+        if wanted == (0.0 if alike else 0.5 * np.pi):  # both axes are one
+            return cls(apart, np.cross(a, b))
+        angle = np.clip(along, -1.0, 1.0)
+        return cls(apart, (np.arccos(angle) if alike else np.arcsin(angle)) - wanted)
+
+
+def _wanted(one: Incidence) -> float:
+    """Angle between features, rad."""
+    return _WANTED.get(one.relation, float(np.radians(one.angle_deg)))
+
+
+def _axis(points: FloatArray) -> FloatArray:
+    """Direction (..., 3) of a line through two points (..., 2, 3), or normal of a plane through three."""
+    D = points[..., 1:, :] - points[..., :1, :]
+    axis = D[..., 0, :] if D.shape[-2] == 1 else np.cross(D[..., 0, :], D[..., 1, :])
+    return np.asarray(axis / np.linalg.norm(axis, axis=-1, keepdims=True))
+
+
+def angle_off(one: Incidence, tool: FloatArray, scene: FloatArray) -> float:
+    """Angle, rad, by which features spanned by points (k, 3) are off; in their sense if both are alike."""
+    cosine = float(np.clip(_axis(tool) @ _axis(scene), -1.0, 1.0))
+    between = np.arccos(cosine) if len(tool) == len(scene) else abs(np.arcsin(cosine))
+    return float(abs(between - _wanted(one)))
+
+
+class Ends(NamedTuple):
+    """Where a goal was taught, and where the tool is: images (V, k, 2), and displacements to begin with."""
+
+    taught: Look
+    now: Look
+    H_taught: FloatArray
+    H: FloatArray  # H_taught, H: (4, 4) in the calibrated frame
+    taught_mm: float = 0.0
+    taught_deg: float = 0.0  # taught_mm, taught_deg: deviation of the goal besides that by its images
+
+
+class IncidenceErrors(NamedTuple):
+    """Errors of incidences (g,), and their deviations; NaN if undefined or unknown."""
+
+    mm: FloatArray  # of the point that is off most, as images show it
+    deg: FloatArray
+    deviation_mm: FloatArray
+    deviation_deg: FloatArray
+
+
+class _Placed(NamedTuple):
+    """A body where the goal was taught and where it is, in the metric frame of the arm."""
+
+    M: FloatArray  # (B, k, 4) markers at the reference, as calibrated and off by its errors
+    T: FloatArray  # (2, 4, 4) displacements
+    E: FloatArray  # (6, 4, 4) generators of steps of them
+    unit_mm: FloatArray  # (B,) mm in a unit; 1 where no length is known
+    errors: tuple[FloatArray, FloatArray]  # (6, ...) of each displacement, by independent errors
+
+    def vectors(self, one: Incidence, M: FloatArray, T: FloatArray, unit_mm: FloatArray) -> FloatArray:
+        """Vectors (..., c) of an incidence, mm, then rad, of markers (..., k, 4) at (..., 2, 4, 4)."""
+        at = Separation.of(one, *_features(one, M, T))
+        apart = unit_mm[..., None, None] * at.apart
+        return np.concatenate([apart.reshape(*apart.shape[:-2], -1), at.turned], axis=-1)
+
+    def changes(self, one: Incidence) -> FloatArray:
+        """Changes (c, ...) of these by independent errors of unit variance."""
+        shared = changes_of(self.vectors(one, self.M, self.T[None], self.unit_mm)).T
+        apart = [self.by_motion(one, k) @ errors for k, errors in enumerate(self.errors)]
+        c = shared.shape[1]  # errors of the calibration come first, and are common
+        own = [part[:, c:] for part in apart]
+        return np.hstack([shared + apart[0][:, :c] + apart[1][:, :c], *own])
+
+    def by_motion(self, one: Incidence, which: int) -> FloatArray:
+        """Derivatives (c, 6) by steps of one of both displacements."""
+        steps = expm(_STEP * np.concatenate([self.E, -self.E]))
+        T = np.broadcast_to(self.T, (len(steps), *self.T.shape)).copy()
+        T[:, which] = T[:, which] @ steps
+        up, down = np.split(self.vectors(one, self.M[0], T, self.unit_mm[:1]), 2)
+        return np.asarray((up - down).T / (2.0 * _STEP))
+
+
+def _features(one: Incidence, M: FloatArray, T: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Points (..., k, 3) that span the feature of the tool, and that of the scene; arguments as above."""
+    tool, scene = (
+        np.stack([M[..., list(numbers), :].mean(axis=-2) for numbers in flat], axis=-2)
+        for flat in (one.tool, one.scene)
+    )
+    there, here = (np.swapaxes(T[..., k, :, :], -1, -2) for k in range(2))
+    return (tool @ here)[..., :3], (scene @ there)[..., :3]
+
+
+@lru_cache(maxsize=8)
+def _rig(c: Calibration) -> LookRig | None:
+    """Cameras and tool in the metric of the arm; None where the joints leave it open."""
+    try:
+        rig = LookRig.of(c)
+    except WorkFailed:
+        return None
+    return rig if rig.rigid else None
+
+
+def _placed(c: Calibration, rig: LookRig, markers: Sequence[int], ends: Ends, unit_mm: FloatArray) -> _Placed:
+    """Fit both poses of the body to their images."""
+    M, back = rig.M[:, list(markers)], np.linalg.inv(rig.G)
+    E = generators(rig.turns, M[0, :, :3].mean(axis=0))
+    fits = [
+        BundleFit.settled(rig.bundle([look], E), M[0], (rig.G @ H @ back)[None])
+        for look, H in ((ends.taught, ends.H_taught), (ends.now, ends.H))
+    ]
+    errors = [np.hstack(fit.errors(rig, M)[::-1]) for fit in fits]
+    return _Placed(M, np.concatenate([fit.T for fit in fits]), E, unit_mm, (errors[0], errors[1]))
+
+
+def _mm_a_unit(M: FloatArray, lengths: FloatArray) -> FloatArray:
+    """Millimetres (B,) a unit of markers (B, k, 4), by lengths (m, m), m, between the first, if known."""
+    i, k = np.nonzero(lengths > 0.0)
+    if not len(i):
+        return np.full(len(M), np.nan)
+    apart = np.linalg.norm(M[:, i, :3] - M[:, k, :3], axis=-1)
+    return np.asarray(MM * np.median(lengths[i, k] / apart, axis=1))
+
+
+def errors_of(
+    c: Calibration, markers: Sequence[int], asked: Sequence[Incidence], ends: Ends, lengths: FloatArray
+) -> IncidenceErrors:
+    """State how far features are from where incidences want them; NaN where the joints leave the metric open.
+
+    markers : (k,) indices of the markers of the body, of which the face comes first.
+    asked : incidences by positions in the body.
+    lengths : (m, m) between the markers of the face, m; mm are NaN without any.
+    """
+    found, rig = np.full((len(asked), 4), np.nan), _rig(c)
+    if rig is None or not np.isfinite([ends.H_taught, ends.H]).all():
+        return IncidenceErrors(*found.T)
+    unit = _mm_a_unit(rig.M[:, list(markers)], lengths)
+    known = np.isfinite(unit[0])
+    placed = _placed(c, rig, markers, ends, unit if known else np.ones(len(unit)))
+    for row, one in zip(found, asked, strict=True):
+        tool, scene = _features(one, placed.M[0], placed.T)
+        apart, turned = Separation.of(one, tool, scene)
+        variance = np.square(placed.changes(one)).sum(axis=1)
+        if apart.size and known:
+            off = unit[0] * np.linalg.norm(apart, axis=1)
+            k = int(np.argmax(off))
+            row[0], row[2] = (
+                off[k],
+                np.hypot(np.sqrt(variance[: apart.size].reshape(-1, 3)[k].sum()), ends.taught_mm),
+            )
+        if turned.size:
+            row[1] = np.degrees(angle_off(one, tool, scene))
+            row[3] = np.hypot(np.degrees(np.sqrt(variance[apart.size :].sum())), ends.taught_deg)
+    return IncidenceErrors(*found.T)
