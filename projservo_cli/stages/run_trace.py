@@ -226,7 +226,9 @@ def _incidence_errors(
 ) -> IncidenceErrors:
     """State how far incidences are off at the end, where the body is displaced by H (4, 4)."""
     scenario, world, plan = run.scenario, run.scenario.world, run.plan
-    s, carried = run.log.s[run.steps], plan if isinstance(plan, Plan) and plan.object_name else None
+    carried = plan if isinstance(plan, Plan) and plan.object_name else None
+    s, shown = np.full_like(images.s_star, np.nan), run.log.s[run.steps]
+    s[:, : shown.shape[1]] = shown  # of a law that measures points those of the face alone
     # The images of a goal that was carried along are predicted: its deviation is stated besides.
     noise_px = (0.0 if carried else scenario.goal_sigma_px), world.noise_px
     of_goal, now = (np.full(s.shape[:2], max(px, _EXACT_PX)) for px in noise_px)

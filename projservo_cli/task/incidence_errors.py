@@ -96,7 +96,7 @@ class IncidenceErrors(NamedTuple):
     deviation_deg: FloatArray
 
 
-class _Placed(NamedTuple):
+class Placed(NamedTuple):
     """A body where the goal was taught and where it is, in the metric frame of the arm."""
 
     M: FloatArray  # (B, k, 4) markers at the reference, as calibrated and off by its errors
@@ -139,7 +139,7 @@ def _features(one: Incidence, M: FloatArray, T: FloatArray) -> tuple[FloatArray,
 
 
 @lru_cache(maxsize=8)
-def _rig(c: Calibration) -> LookRig | None:
+def metric_rig(c: Calibration) -> LookRig | None:
     """Cameras and tool in the metric of the arm; None where the joints leave it open."""
     try:
         rig = LookRig.of(c)
@@ -148,7 +148,7 @@ def _rig(c: Calibration) -> LookRig | None:
     return rig if rig.rigid else None
 
 
-def _placed(c: Calibration, rig: LookRig, markers: Sequence[int], ends: Ends, unit_mm: FloatArray) -> _Placed:
+def placed_by(rig: LookRig, markers: Sequence[int], ends: Ends, unit_mm: FloatArray) -> Placed:
     """Fit both poses of the body to their images."""
     M, back = rig.M[:, list(markers)], np.linalg.inv(rig.G)
     E = generators(rig.turns, M[0, :, :3].mean(axis=0))
@@ -157,10 +157,10 @@ def _placed(c: Calibration, rig: LookRig, markers: Sequence[int], ends: Ends, un
         for look, H in ((ends.taught, ends.H_taught), (ends.now, ends.H))
     ]
     errors = [np.hstack(fit.errors(rig, M)[::-1]) for fit in fits]
-    return _Placed(M, np.concatenate([fit.T for fit in fits]), E, unit_mm, (errors[0], errors[1]))
+    return Placed(M, np.concatenate([fit.T for fit in fits]), E, unit_mm, (errors[0], errors[1]))
 
 
-def _mm_a_unit(M: FloatArray, lengths: FloatArray) -> FloatArray:
+def mm_a_unit(M: FloatArray, lengths: FloatArray) -> FloatArray:
     """Millimetres (B,) a unit of markers (B, k, 4), by lengths (m, m), m, between the first, if known."""
     i, k = np.nonzero(lengths > 0.0)
     if not len(i):
@@ -178,12 +178,12 @@ def errors_of(
     asked : incidences by positions in the body.
     lengths : (m, m) between the markers of the face, m; mm are NaN without any.
     """
-    found, rig = np.full((len(asked), 4), np.nan), _rig(c)
+    found, rig = np.full((len(asked), 4), np.nan), metric_rig(c)
     if rig is None or not np.isfinite([ends.H_taught, ends.H]).all():
         return IncidenceErrors(*found.T)
-    unit = _mm_a_unit(rig.M[:, list(markers)], lengths)
+    unit = mm_a_unit(rig.M[:, list(markers)], lengths)
     known = np.isfinite(unit[0])
-    placed = _placed(c, rig, markers, ends, unit if known else np.ones(len(unit)))
+    placed = placed_by(rig, markers, ends, unit if known else np.ones(len(unit)))
     for row, one in zip(found, asked, strict=True):
         tool, scene = _features(one, placed.M[0], placed.T)
         apart, turned = Separation.of(one, tool, scene)

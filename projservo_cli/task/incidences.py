@@ -135,10 +135,19 @@ def _rate_of(row: FloatArray, H: Mat4, H_back: Mat4, H_hat: Mat4) -> float:
 
 
 @merged
-def _points_away(sense: FloatArray, H: Mat4, H_back: Mat4) -> bool:
+def points_away(sense: FloatArray, H: Mat4, H_back: Mat4) -> bool:
     """Whether a direction or plane of the tool points the other way than it should at H."""
     moved = apply_transposed(H_back, vec(sense)) if sense[_IS_PLANE] > 0.0 else apply(H, vec(sense))
     return dot(moved, vec(sense[_SCENE:])) < 0.0
+
+
+@merged
+def turn_rate(sense: FloatArray, H: Mat4, H_back: Mat4, H_hat: Mat4) -> float:
+    """Derivative by the amplitude of an operator Ĥ of the body at H of what is positive in its sense."""
+    to = vec(sense[_SCENE:])
+    if sense[_IS_PLANE] > 0.0:
+        return -dot(apply_transposed(H_hat, apply_transposed(H_back, vec(sense))), to)
+    return dot(apply(H_hat, apply(H, vec(sense))), to)
 
 
 @njit
@@ -154,7 +163,7 @@ def image_error(incidences: Incidences, H: Mat4, H_back: Mat4) -> float:
             error += rows[i, _WEIGHT + k] * _error_of(rows[i], H, H_back)
         total += error * error
     for sense in incidences.senses:
-        if _points_away(sense, H, H_back):
+        if points_away(sense, H, H_back):
             total += sense[_TURN_PX] * sense[_TURN_PX]
     return math.sqrt(total / incidences.sight[_VIEWS_USED])
 
@@ -479,7 +488,7 @@ def _turned_px(incidences: Incidences, H: FloatArray) -> FloatArray:
 def _away_at(incidences: Incidences, H: FloatArray) -> BoolArray:
     """Whether features (g,) point the other way at H (4, 4)."""
     here, back = mat(H), mat(np.asarray(np.linalg.inv(H), dtype=np.float64))
-    return np.array([_points_away(sense, here, back) for sense in incidences.senses], dtype=np.bool_)
+    return np.array([points_away(sense, here, back) for sense in incidences.senses], dtype=np.bool_)
 
 
 def turned_about(body: Body, H: FloatArray) -> FloatArray:
