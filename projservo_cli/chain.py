@@ -378,6 +378,9 @@ class Chain:
         place, run = STAGES.index(step.stage), replace(self.run, configuration=run.configuration)
         after = [name for name in run.results if STAGES.index(name.split("/")[0]) > place]
         after += self._of_other_tasks(step, run)
+        if why := self._would_lose(step, result, after):
+            self._fail(step, why)
+            return
         results = {name: stored for name, stored in run.results.items() if name not in after}
         refuted = run.refuted
         if step.stage == "calibrate":
@@ -388,6 +391,21 @@ class Chain:
         self._keep(replace(run, results={**results, step.name: result}, refuted=refuted))
         if after:
             self.listener.say(f"{', '.join(after)}: dropped, their inputs were replaced")
+        if step.law and result.records[""].verdict == "interrupted":
+            raise KeyboardInterrupt
+
+    def _would_lose(self, step: Step, result: Any, after: Sequence[str]) -> str:
+        """Say which runs of a robot of somebody's a plan that cannot be followed would drop."""
+        driven = [name for name in after if name.startswith(SERVO)]
+        if step.stage != "plan" or "servo" in self.names or self.config.plant.simulated or not driven:
+            return ""
+        plan = result.records[""]
+        if plan.feasible or plan.profile not in ("constrained", "joint_space"):
+            return ""
+        return (
+            f"{plan.reason}; not stored, since a robot was driven for {', '.join(driven)}, which would be "
+            "dropped: give another -o to keep both"
+        )
 
     def _of_other_tasks(self, step: Step, run: Run) -> list[str]:
         """Names of plans that are not of this task, and of results of steps that are to come."""

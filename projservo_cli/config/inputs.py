@@ -208,6 +208,7 @@ def plan_inputs(config: Config, files: Files | None = None, *, predicted: bool =
     simulated = config.plant.simulated and not predicted
     known = markers.known if markers.tags is not None else ()
     pairs = () if config.task is None else config.task.goal.incidences
+    displaced = _displacement(config)
     return PlanInputs(
         task=config.task,
         seed=config.seed,
@@ -228,20 +229,25 @@ def plan_inputs(config: Config, files: Files | None = None, *, predicted: bool =
         tests_images=config.stop.innovation_threshold > 0.0,
         trajectory=config.trajectory,
         lengths=markers.lengths(face),
-        incidences=tuple(_incidence(pair, config.features) for pair in pairs),
+        incidences=tuple(_incidence(pair, config.features, displaced) for pair in pairs),
         carrier=_carrier(config, files),
-        displaced=_displacement(config),
+        displaced=displaced,
     )
 
 
-def _incidence(pair: Pair, features: Mapping[str, Feature]) -> Incidence:
-    """Return a pair of features, as messages and figures write it, with the numbers of its markers."""
+def _incidence(pair: Pair, features: Mapping[str, Feature], displaced: StandOff | None) -> Incidence:
+    """Return a pair of features, as messages and figures write it, with the numbers of its markers.
+
+    displaced : of the goal, so that nobody takes an approach for the arrival.
+    """
+    back = "" if displaced is None else f" ({displaced.words})"
     relation = pair[2] if len(pair) == 3 else MEET
     tool, scene = (features[name].flat(features) for name in pair[:2])
     if not isinstance(relation, str):
-        return Incidence(f"{pair[0]} at {relation:g}° to {pair[1]}", tool, scene, ANGLE, float(relation))
+        name = f"{pair[0]} at {relation:g}° to {pair[1]}{back}"
+        return Incidence(name, tool, scene, ANGLE, float(relation))
     between = {MEET: "on", PARALLEL: "parallel to", PERPENDICULAR: "perpendicular to"}[relation]
-    return Incidence(f"{pair[0]} {between} {pair[1]}", tool, scene, relation)
+    return Incidence(f"{pair[0]} {between} {pair[1]}{back}", tool, scene, relation)
 
 
 def _displacement(config: Config) -> StandOff | None:

@@ -29,6 +29,7 @@ from projservo_cli.geometry.mechanisms import make_span
 from projservo_cli.loop.verdicts import (
     FAILED,
     FAULT_DETECTED,
+    INTERRUPTED,
     RUNNING,
     WAITING,
     Command,
@@ -282,6 +283,10 @@ def run_in_python(
                 if k == 0:
                     raise
                 verdict, plant.disturbance = FAILED, told(str(error), REFUSES)
+            except KeyboardInterrupt:
+                if k == 0:
+                    raise
+                verdict = INTERRUPTED
             k += verdict < 0
     finally:
         plant.stop()

@@ -14,7 +14,7 @@ from projservo_cli.geometry.kernels import COORDINATES
 from projservo_cli.laws import CODES
 from projservo_cli.loop.batch import NUMBERS, VERDICT, Batch, Setting
 from projservo_cli.loop.compiled import Course
-from projservo_cli.loop.verdicts import RUNNING, VERDICT_NAMES
+from projservo_cli.loop.verdicts import INTERRUPTED, RUNNING, VERDICT_NAMES
 from projservo_cli.records import (
     VIEWS,
     Calibration,
@@ -330,6 +330,8 @@ def _run(
             made = drive(scenario, _plan(given.plan, calibration, design.calibration_key(cell, number)), name)
     except WorkFailed as error:
         return {"verdict": _NOT_STARTED}, None, str(error)
+    if made.verdict == VERDICT_NAMES[INTERRUPTED]:
+        raise KeyboardInterrupt
     row = {"verdict": made.verdict, "steps": made.steps, **made.summary._asdict()}
     row |= zip(_self_occluded(scenario.world.view), made.self_occluded_steps, strict=True)
     if design.sweep.between_samples:

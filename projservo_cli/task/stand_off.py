@@ -29,6 +29,12 @@ class StandOff(NamedTuple):
     by_px: float | None  # mean motion of the images in the view in which they move most
     of_start: bool = False  # whether it is that of the start instead of the goal
 
+    @property
+    def words(self) -> str:
+        """How far the goal is displaced, as names of its incidences have it."""
+        by = f"{1e3 * self.by_m:g} mm" if self.by_m is not None else f"{self.by_px:g} px"
+        return f"{by} back along {self.name}"
+
 
 def _direction_back(model: Model, body: Body, H: FloatArray, asked: StandOff) -> FloatArray:
     """Direction (4,) back along the feature of the body at H (4, 4), of any length."""

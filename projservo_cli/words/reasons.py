@@ -56,6 +56,9 @@ VERDICTS = {
     "object moved": Verdict(
         "the object that carries the goal moved", "let it lie still, and plan again", ends=True
     ),
+    "interrupted": Verdict(
+        "somebody ended it, as with Ctrl-C; its trace up to there is kept", "", ends=True, retried=True
+    ),
     "not calibrated": Verdict("a run of a sweep has no calibration", "look why it is refused"),
     "not started": Verdict("a run of a sweep could not begin", "read its reason"),
 }
@@ -84,6 +87,7 @@ REASONS = {
     ),
     "joint_limit": Row("{joints} stands at its limit, {amount}, and the task would take it beyond"),
     "singular": Row("the joint motion was not unique at step {count}: the robot is near a singularity"),
+    "interrupted": Row("interrupted at step {count}"),
     "remaining": Row("{left}an {name} of {amount} is left"),
     "vague_markers": Row("markers there state {amount} times the noise", "look what covers them"),
     "face_apart": Row(

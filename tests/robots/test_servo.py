@@ -136,11 +136,35 @@ def test_a_robot_that_fails_ends_the_run_in_one_line_and_no_other_law_drives_it(
     assert np.isfinite(trace.s[-1]).all() == fault.startswith("command")
 
 
-def test_ctrl_c_stops_the_robot(servo):
-    answer = servo(*faulty("interrupted", 12), *QUICK)
+def test_ctrl_c_stops_the_robot_and_keeps_the_trace(servo):
+    answer = servo(*faulty("interrupted", 17), *QUICK, "--law", "exact")
     assert answer.code == 130
     assert CALLS[-2:] == ["stop", "close"]
     assert commands()
+    (trace,) = load("run").traces.values()
+    assert (trace.law, trace.verdict, trace.reason) == (
+        "direct_three",
+        "interrupted",
+        f"interrupted at step {trace.steps}",
+    )
+    assert trace.steps > 10
+    assert np.isfinite(trace.q[:-1]).all()
+    # It is no result: the same command drives the law again.
+    again = servo(*faulty("none", 10**6), *QUICK, "--json")
+    assert again.json["laws"][0]["verdict"] != "interrupted"
+
+
+def test_a_plan_that_cannot_be_followed_drops_no_run_of_a_robot(servo, projservo):
+    assert servo(*SOUND, *QUICK).code == 0
+    before = load("run").traces["direct_three"].q
+    shut = ["trajectory.profile=constrained", "trajectory.border_px=400"]
+    sets = [word for one in shut for word in ("--set", one)]
+    answer = projservo("plan", "-c", UR5, "-o", "run", *SOUND, *QUICK, *sets)
+    assert answer.code == 1
+    assert "not stored, since a robot was driven for servo/direct_three" in " ".join(answer.err.split())
+    np.testing.assert_array_equal(load("run").traces["direct_three"].q, before)
+    apart = projservo("plan", "-c", UR5, "-o", "other", *SOUND, *QUICK, *sets)
+    assert "not stored" not in apart.err
 
 
 @pytest.mark.parametrize(
