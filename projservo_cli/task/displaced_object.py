@@ -25,6 +25,7 @@ from projservo_cli.geometry.lens import undistort
 from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.metric.frame import Metric, changes_of
 from projservo_cli.records import (
+    CORNERS,
     MM,
     TOOL,
     BoolArray,
@@ -49,6 +50,8 @@ _MINIMA = 3
 # Chance of residuals beyond which they are not those of the same rigid object, and error of a finder that all
 # frames of a look have alike, px: by rendered tags that lie as they did.
 _BY_CHANCE, ALIKE_PX = 1e-4, 0.02
+# Chance by which a tag of an object, which lies as it did, seems to have slipped.
+_SLIPPED = 1e-3
 # Of so many markers seen in a look, one that is off by itself may be left out.
 _SHARE = 8
 # Cosine of the angle between the axis of a turn and a line of markers, above which it is about that line.
@@ -189,28 +192,79 @@ class _Search:
         return Finding("object_turned", REFUSES, shown, at_most, limit=_UNSEEN, unit="rad", others=about)
 
 
-def _elsewhere(rig: LookRig, fit: BundleFit) -> tuple[float, float, int, int] | None:
-    """Residuals of markers that do not lie as they did, beyond chance by noise and calibration.
+class _Off(NamedTuple):
+    """Markers that do not lie as they did, beyond chance by noise and calibration."""
 
-    Returns how many times the noise they are, and at most by chance, with look and marker that are off most;
-    None if they do.
+    times: float
+    most: float  # times, most: residuals over the noise, and at most by chance
+    look: int
+    markers: tuple[int, ...]  # look, markers: of the one that is off most, or of a tag that moved by itself
+
+
+class _Left(NamedTuple):
+    """Residuals (N,) that a fit leaves of its images, over their deviation, with those of errors alike."""
+
+    r: FloatArray
+    J: FloatArray  # (N, p) by the coordinates of the fit
+    of_calibration: FloatArray  # (N, c) by its errors
+
+    @classmethod
+    def of(cls, rig: LookRig, fit: BundleFit) -> Self:
+        """Residuals of a fit."""
+        r, J = fit.linearized()
+        share = 1.0 / np.hypot(1.0, ALIKE_PX * np.repeat(fit.bundle.weight[fit.bundle.weight > 0.0], 2))
+        return cls(share * r, share[:, None] * J, share[:, None] * fit.moved(rig, fit.X))
+
+    def after(self, more: FloatArray) -> tuple[FloatArray, float]:
+        """Residuals (N,) that further columns (N, k) leave as well, and their χ² with the calibration."""
+        J = np.hstack([self.J, more])
+        seen = np.column_stack([self.r, self.of_calibration])
+        r, left = np.split(seen - J @ np.linalg.lstsq(J, seen)[0], [1], axis=1)
+        r, along = r[:, 0], left.T @ r[:, 0]
+        return r, float(r @ r - along @ np.linalg.solve(np.eye(left.shape[1]) + left.T @ left, along))
+
+
+def _elsewhere(rig: LookRig, fit: BundleFit, marker: Sequence[int]) -> _Off | None:
+    """Find markers (k,) that do not lie as they did; None if all do.
+
+    By all residuals, else by those that one tag leaves which moved by itself since the first look.
     """
-    r, J = fit.linearized()
-    dof = len(r) - J.shape[1]
+    left, seen = _Left.of(rig, fit), fit.bundle.weight > 0.0
+    dof = len(left.r) - left.J.shape[1]
     if dof < 1:
         return None
-    share = 1.0 / np.hypot(1.0, ALIKE_PX * np.repeat(fit.bundle.weight[fit.bundle.weight > 0.0], 2))
-    J, seen = share[:, None] * J, np.column_stack([share * r, share[:, None] * fit.moved(rig, fit.X)])
-    r, left = np.split(seen - J @ np.linalg.lstsq(J, seen)[0], [1], axis=1)
-    r, along = r[:, 0], left.T @ r[:, 0]
-    square = r @ r - along @ np.linalg.solve(np.eye(left.shape[1]) + left.T @ left, along)
-    if square <= (most := chdtri(dof, _BY_CHANCE)):
-        return None
-    off = np.zeros(fit.bundle.weight.shape)
-    off[fit.bundle.weight > 0.0] = (r.reshape(-1, 2) ** 2).sum(axis=1)
-    at_look = off.sum(axis=1)
-    look, k = np.unravel_index(int(np.argmax(at_look)), at_look.shape)
-    return float(np.sqrt(square / dof)), float(np.sqrt(most / dof)), int(look), int(k)
+    r, square = left.after(np.zeros((len(left.r), 0)))
+    if square > (most := chdtri(dof, _BY_CHANCE)):
+        off = np.zeros(seen.shape)
+        off[seen] = (r.reshape(-1, 2) ** 2).sum(axis=1)
+        at_look = off.sum(axis=1)
+        look, k = np.unravel_index(int(np.argmax(at_look)), at_look.shape)
+        return _Off(float(np.sqrt(square / dof)), float(np.sqrt(most / dof)), int(look), (int(k),))
+    tags = _tags(marker)
+    for tag in tags if len(tags) > 1 else ():
+        by_tag = _by_motion(rig, fit, tag)[seen].reshape(len(left.r), -1)
+        fell, g = square - left.after(by_tag)[1], by_tag.shape[1]
+        if fell > (most := chdtri(g, _SLIPPED / len(tags))):
+            return _Off(float(np.sqrt(fell / g)), float(np.sqrt(most / g)), len(fit.T) - 1, tag)
+    return None
+
+
+def _tags(marker: Sequence[int]) -> list[tuple[int, ...]]:
+    """Positions of the corners of each tag among markers (k,), of those of which all are there."""
+    at = {number: k for k, number in enumerate(marker)}
+    corners = {CORNERS * (number // CORNERS): None for number in marker}
+    whole = [[first + k for k in range(CORNERS)] for first in corners]
+    return [tuple(at[number] for number in tag) for tag in whole if all(number in at for number in tag)]
+
+
+def _by_motion(rig: LookRig, fit: BundleFit, tag: Sequence[int]) -> FloatArray:
+    """Derivatives (L, V, k, 2, g) of images by displacements of some markers in the last look."""
+    bundle, X, T = fit.bundle, fit.X[None], fit.T[None]
+    own = bundle._replace(E=generators(rig.linear, fit.X[list(tag), :3].mean(axis=0)))
+    moved: FloatArray = own.by_motion(bundle.residuals(X, T)[1], X, T)[0]
+    alone = np.zeros_like(moved)
+    alone[-1][:, list(tag)] = moved[-1][:, list(tag)]
+    return alone
 
 
 def _of_one_object(
@@ -224,17 +278,18 @@ def _of_one_object(
     looks, left_out = list(looks), list[int]()
     while True:
         fit, found_in, known = _Search(rig, marker, looks).found()
-        off = _elsewhere(rig, fit)
+        numbers = np.asarray(marker)[known]
+        off = _elsewhere(rig, fit, numbers.tolist())
         if off is None:
             return fit, known, tuple(left_out)
-        (times, most), look, k = off[:2], found_in[off[2]], int(np.flatnonzero(known)[off[3]])
+        look, which = found_in[off.look], numbers[list(off.markers)].tolist()
         seen = np.isfinite(looks[look].s).all(axis=-1).any(axis=0)
-        if (1 + len(left_out)) * _SHARE > seen.sum():
-            of = Subject(markers=(int(marker[k]),))
-            raise unknown(Finding("object_deformed", REFUSES, of, times, limit=most, unit="1"))
-        left_out.append(int(marker[k]))
+        if (len(which) + len(left_out)) * _SHARE > seen.sum():
+            of = Subject(markers=tuple(which))
+            raise unknown(Finding("object_deformed", REFUSES, of, off.times, limit=off.most, unit="1"))
+        left_out += which
         s = looks[look].s.copy()
-        s[:, k] = np.nan
+        s[:, np.isin(marker, which)] = np.nan
         looks[look] = looks[look]._replace(s=s)
 
 

@@ -202,6 +202,25 @@ def test_a_marker_that_is_off_by_itself_is_left_out_of_its_look(arm, c):
     np.testing.assert_allclose(found.D, gone.D, rtol=0.0, atol=1e-12)
 
 
+@pytest.mark.parametrize("tag", [0, 1])
+def test_a_tag_that_slipped_by_itself_is_named_before_all_residuals_tell(tag, arm, c):
+    """Growing slips are refused by the corners of a tag first, by which half of them are found."""
+    own = slice(4 * tag, 4 * tag + 4)
+    for slip in np.linspace(0.0, 0.05, 51):
+        X = OBJECT.copy()
+        X[own, 0] += slip
+        seen = [looks(arm)[0], looks(arm, MOVED, X=X)[1]]
+        try:
+            DisplacedObject.of(c, NUMBERS, seen)
+        except WorkFailed as error:
+            (one,) = error.findings
+            break
+    assert one.code == "object_deformed"
+    assert one.subject.markers in {(40, 41, 42, 43), (44, 45, 46, 47)}  # two tags that move apart
+    assert one.amount > one.limit
+    assert slip > 0.001
+
+
 def test_what_is_no_displaced_object_is_named(arm, c):
     taught, now = looks(arm, MOVED)
     deformed = Look(now.s + np.where(np.arange(8) >= 5, 40.0, 0.0)[:, None])
