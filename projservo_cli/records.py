@@ -790,6 +790,9 @@ class CarriedByObject:
     s_object: FloatArray | None = _optional_array(
         "view object_marker xy", "px", "images of these when it was planned, NaN if unseen"
     )
+    s_object_taught: FloatArray | None = _optional_array(
+        "view object_marker xy", "px", "images of these when the goal was taught, NaN if unseen"
+    )
     sigma_object: FloatArray | None = _optional_array(
         "view object_marker", "px", "standard deviation of a coordinate of these, NaN if unknown"
     )
@@ -1009,6 +1012,12 @@ class RunHistory:
         "deg",
         "angle that an incidence is off at the end, as stated likewise; NaN of points, or where the joints "
         "leave angles open",
+    )
+    free_motion: FloatArray | None = _optional_array(
+        "freedom joint", "rad or m", "joint motions of unit norm that the incidences leave free at the end"
+    )
+    free_s: FloatArray | None = _optional_array(
+        "freedom view marker xy", "px", "velocities of the images of the face by these, per rad or m"
     )
     incidence_deviation_mm: FloatArray | None = _optional_array(
         "incidence", "mm", "deviation of the distance by images, calibration and object"

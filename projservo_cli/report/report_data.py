@@ -210,10 +210,7 @@ class FigureSpec:
     shares: bool = False  # whether it shows shares of translation and rotations
     modes: bool = False  # whether it compares runs that follow the plan with others
     goal: bool = False  # whether it needs a known goal pose
-    frames: bool = False  # whether it shows frames
-    incidences: bool = False  # whether it shows those of the goal
-    sequence: bool = False  # whether it shows the motions of a sequence
-    runs: bool = False  # whether it shows all runs, where there are some of laws that are not in the paper
+    shows: str = ""  # what is not in every run, by its name in ``_SHOWN``
     task: bool = True  # whether it needs a task; else a calibration with its observations is enough
     metric: bool = False  # whether it needs the calibration in metres
 
@@ -227,7 +224,7 @@ class FigureSpec:
     @property
     def optional(self) -> bool:
         """Whether it is left out without a word where a run has nothing to show in it."""
-        return self.frames or self.incidences or self.sequence or self.runs
+        return bool(self.shows)
 
     def drawn(self, data: Data) -> "Figure":
         """The figure of its data."""
@@ -237,19 +234,9 @@ class FigureSpec:
         """Return the reason why the figure cannot be drawn; empty if it can."""
         if not self.task:
             return report_data.no_metric if self.metric else ""
-        if self.frames and isinstance(report_data, Driven | ReportData):
-            filmed = any(trace.frame_index is not None for trace in report_data.traces.values())
-            return "" if filmed else "the robot shows no frames"
-        if self.runs and isinstance(report_data, Driven | ReportData):
-            others = {*moved(report_data)} - {*DIRECT, *POINT_LAWS}
-            parts = any("/" in name for name in others)  # of a sequence, which has a figure of its own
-            return "" if others and not parts else "all runs are of laws of the paper"
-        if self.incidences and isinstance(report_data, Driven | ReportData):
-            partial = any(trace.feature_s is not None for trace in report_data.traces.values())
-            return "" if partial else "the goal is a whole pose"
-        if self.sequence:
-            steps = isinstance(report_data, Driven) and any("/" in name for name in report_data.traces)
-            return "" if steps else "the task is one motion"
+        if self.shows and isinstance(report_data, Driven | ReportData):
+            shown, why = _SHOWN[self.shows]
+            return "" if shown(report_data) else why
         if isinstance(report_data, Driven):
             return report_data.lacks
         if len(report_data.calibration.joint_types) == 1:
@@ -285,6 +272,28 @@ class FigureSpec:
         ]
 
 
+def _any_has(field: str) -> Callable[["Driven | ReportData"], bool]:
+    """Return whether some run has an array."""
+    return lambda report_data: any(getattr(trace, field) is not None for trace in report_data.traces.values())
+
+
+def _of_other_laws(report_data: "Driven | ReportData") -> bool:
+    """Whether runs are of laws that are not in the paper; those of a sequence have a figure of their own."""
+    others = {*moved(report_data)} - {*DIRECT, *POINT_LAWS}
+    return bool(others) and not any("/" in name for name in others)
+
+
+# What figures show that is not in every run: whether it is, and why else it is left out.
+_SHOWN: dict[str, tuple[Callable[[Any], bool], str]] = {
+    "frames": (_any_has("frame_index"), "the robot shows no frames"),
+    "incidences": (_any_has("feature_s"), "the goal is a whole pose"),
+    "sequence": (
+        lambda found: isinstance(found, Driven) and any("/" in name for name in found.traces),
+        "the task is one motion",
+    ),
+    "runs": (_of_other_laws, "all runs are of laws of the paper"),
+    "object": (lambda found: found.plan.s_object_taught is not None, "no object carries the goal"),
+}
 REGISTER: dict[str, FigureSpec] = {}
 _Draw = Callable[[Data, "Figure"], None]
 

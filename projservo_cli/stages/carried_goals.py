@@ -73,6 +73,7 @@ def carried_goal(
         "object_marker": np.array(carrier.numbers, dtype=np.int64),
         "object_left_out": ", ".join(map(str, found.left_out)) or None,
         "s_object": now.s,
+        "s_object_taught": taught.s,
         "sigma_object": now.sigma,
         "s_carried": np.ascontiguousarray(goal.s[:, c.indices_of(scenario.world.numbers)]),
     }

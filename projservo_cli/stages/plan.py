@@ -54,7 +54,7 @@ from projservo_cli.stages.scenario import Scenario, scenario_of
 from projservo_cli.stages.stage_inputs import PlanInputs
 from projservo_cli.task.contradictions import contradictions
 from projservo_cli.task.face import Task, center_of, face_plane
-from projservo_cli.task.incidences import errors_px, linearized
+from projservo_cli.task.incidences import errors_px, free_motions
 from projservo_cli.task.partition import Parts
 from projservo_cli.task.target import TaskImages
 from projservo_cli.task.visibility import (
@@ -202,8 +202,7 @@ def _to_any_goal(scenario: Scenario) -> Plan:
         except WorkFailed as error:
             failures.append(error)
             continue
-        _, J = linearized(task.incidences, H, joint_operators(model, q))
-        free = len(q) - int(np.linalg.matrix_rank(J, 1e-6))
+        free = len(free_motions(task.incidences, H, joint_operators(model, q)))
         plans.append(replace(plan, incidences=names, free_dof=free, s_goal=s_goal))
         if plan.feasible:
             break

@@ -11,7 +11,7 @@ from projservo_cli.control.law import TAU_AFFINE, THETA_S
 from projservo_cli.findings import LIMITS, NOTE, REFUSES, Finding, Subject
 from projservo_cli.geometry.algebra import as_array
 from projservo_cli.geometry.kernels import COORDINATES
-from projservo_cli.geometry.kinematics import forward
+from projservo_cli.geometry.kinematics import forward, image_jacobian, joint_operators
 from projservo_cli.geometry.lens import undistort
 from projservo_cli.laws import REGULATE
 from projservo_cli.loop.run_metrics import Summary
@@ -33,9 +33,11 @@ from projservo_cli.simulation.analytic_plant import rig_distance
 from projservo_cli.simulation.faults import obstruction_of
 from projservo_cli.stages.law_run import LawRun
 from projservo_cli.task.body import SETTLED, fit_body
+from projservo_cli.task.face import Task
 from projservo_cli.task.incidence_errors import Ends, IncidenceErrors, errors_of
 from projservo_cli.task.incidences import (
     errors_px,
+    free_motions,
     images_of,
 )
 from projservo_cli.task.look_bundle import Look
@@ -218,7 +220,19 @@ def _incidences(run: LawRun) -> dict[str, Any]:
         "incidences": tuple(one.name for one in images.incidences),
         "incidence_px": errors_px(task.incidences, H),
         "free_dof": run.plan.free_dof if isinstance(run.plan, Plan) else None,
+        **_free(run, task, H[-1]),
     }
+
+
+def _free(run: LawRun, task: Task, H: FloatArray) -> dict[str, Any]:
+    """Joint motions that incidences leave free at the end, where the body is displaced by H (4, 4)."""
+    model, q = run.scenario.world.model, run.log.read[run.steps]
+    if not np.isfinite(H).all():
+        return {}
+    H_hat = joint_operators(model, q)
+    free = free_motions(task.incidences, H, H_hat)
+    by_joints = image_jacobian(model.P, task.body.M[: run.scenario.world.m] @ H.T, H_hat)
+    return {"free_motion": free, "free_s": np.einsum("vmdj,fj->fvmd", by_joints, free)}
 
 
 def _incidence_errors(

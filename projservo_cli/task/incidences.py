@@ -42,6 +42,8 @@ from projservo_cli.task.body import Body
 
 # Variance of a combination of errors, of unit variance each, below which it depends on the others.
 _DEPENDENT = 1e-9
+# Singular value of errors, px, by motions, below which these are free.
+_FREE = 1e-6
 # Newton steps to a displacement at which all incidences hold: how many, the largest turn of one, rad, and the
 # last, over unit motions; singular value over the largest that counts as zero.
 _STEPS, _STRIDE, _SETTLED, _SINGULAR = 50, 0.5, 1e-12, 1e-9
@@ -195,6 +197,12 @@ def linearized(incidences: Incidences, H: FloatArray, H_hat: FloatArray) -> tupl
     back = np.asarray(np.linalg.inv(H), dtype=np.float64)
     linearize_into(incidences, mat(H), mat(back), np.ascontiguousarray(H_hat), e, J)
     return e, J
+
+
+def free_motions(incidences: Incidences, H: FloatArray, H_hat: FloatArray) -> FloatArray:
+    """Unit motions (f, n) by operators (n, 4, 4) at H (4, 4) that keep all incidences to first order."""
+    _, sizes, motions = np.linalg.svd(linearized(incidences, H, H_hat)[1])
+    return np.asarray(motions[(sizes > _FREE).sum() :])
 
 
 def points_of(M: FloatArray, flat: Flat) -> FloatArray:

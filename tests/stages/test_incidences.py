@@ -92,6 +92,14 @@ def test_features_of_tool_and_scene_are_drawn_where_they_are():
     assert "1 joint motion free" in drawn.axes[0].get_title()
     for axes in drawn.axes[: len(trace.view)]:
         assert sum(line.get_label().startswith("features of the ") for line in axes.lines) == 3
+    assert drawn.axes[2].get_title().startswith("pin on hole\nwithin 0.")
+    # The free motion turns the face about the pin, in truth too, and as its images say.
+    (free,), (velocity,) = trace.free_motion, trace.free_s
+    ends = [trace.q[-1] + by * free for by in (-0.01, 0.01)]
+    before, after = (axis_and_tip(truth, truth.displacement(q)) for q in ends)
+    assert np.linalg.norm(after - before, axis=1).max() < 0.2e-3
+    before, after = (truth.images(q, truth.M_face) for q in ends)
+    assert np.linalg.norm((after - before) / 0.02 - velocity, axis=-1).max() < 0.05 * np.abs(velocity).max()
     motion = motion_of(truth.robot, plant, truth.M, planned, {"exact_track": trace})
     last = motion.runs["exact_track"].features[-1]
     assert np.nanmax(np.abs(last - motion.features)) < 2e-3

@@ -1,12 +1,14 @@
 """Goals on an object that has moved since: carried along, planned and driven, or refused in words."""
 
 import json
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 
 from projservo_cli.records import WorkFailed
+from projservo_cli.report.report_data import REGISTER, Driven
 from tests.configured import calibrate, plan, servo, truth_of
 from tests.known import configured
 from tests.studies.carried_goals import carried_pose
@@ -45,6 +47,20 @@ def test_a_goal_is_carried_along_to_where_it_should_be_as_well_as_is_stated():
     assert (trace.verdict, trace.success) == ("converged", True)
     assert trace.position_error_mm < 3.0 * planned.goal_deviation_mm < 3.0
     assert trace.estimated_position_error_mm > planned.goal_deviation_mm
+    shown, figure = Driven(calibration, None, planned, {"exact_track": trace}), REGISTER["fig22_object"]
+    assert not figure.lacking(shown)
+    panels = figure.drawn(figure.data(shown)).axes
+    assert len(panels) == len(trace.view)
+    for view, axes in enumerate(panels):  # both tags now, and when the goal was taught
+        drawn = {line.get_label(): line.get_xydata() for line in axes.lines}
+        for label, s in (
+            ("object now", planned.s_object),
+            ("object when the goal was taught", planned.s_object_taught),
+        ):
+            seen = drawn[label][np.isfinite(drawn[label][:, 0])]
+            assert {*map(tuple, seen)} == {*map(tuple, s[view])}
+    still = replace(planned, s_object_taught=None)
+    assert "no object" in figure.lacking(Driven(calibration, None, still, {}))
 
 
 def test_incidences_on_an_object_are_met_where_it_is_now():

@@ -227,7 +227,7 @@ def _draw_joints(data: Data, figure: "style.Figure") -> None:
 
 
 def _data_runs(report_data: Driven) -> Data:
-    """Images, image error, joints and joint velocities of every run over time, by its name."""
+    """Images, judged error, joints and joint velocities of every run over time, by its name."""
     order, prismatic = cyclic_order(report_data.plan.A), report_data.calibration.prismatic
     scale, runs = joint_units(prismatic), moved(report_data)
     result: Data = {"run": np.array(runs), "view": np.array(report_data.view), "prismatic": prismatic}
@@ -237,7 +237,7 @@ def _data_runs(report_data: Driven) -> Data:
             f"t_s_{name}": _time(trace),
             f"s_{name}": trace.s[:, :, order],
             f"s_star_{name}": trace.s_star[:, order],
-            f"image_error_px_{name}": trace.image_error,
+            f"error_px_{name}": trace.convergence_error,
             f"q_{name}": trace.q * scale,
             f"q_dot_{name}": trace.q_dot * scale,
             f"verdict_{name}": np.array(f"{title(name)}\n{trace.verdict}, {trace.steps} steps"),
@@ -247,12 +247,12 @@ def _data_runs(report_data: Driven) -> Data:
 
 @registered(
     "fig21_runs",
-    "Every run: images, image error, joints and commands",
+    "Every run: images, error, joints and commands",
     "not in the paper",
     _data_runs,
-    runs=True,
-    alt="A row for each run: the paths of the markers in the camera images, and the image error, the joints "
-    "and the commanded joint velocities over time.",
+    shows="runs",
+    alt="A row for each run: the paths of the markers in the camera images, and the error that decides "
+    "convergence, the joints and the commanded joint velocities over time.",
 )
 def _draw_runs(data: Data, figure: "style.Figure") -> None:
     """Two rows a run: above the images, below its curves over time."""
@@ -276,13 +276,13 @@ def _draw_runs(data: Data, figure: "style.Figure") -> None:
             style.image_axes(panel, f"{below}{names[view]} camera", pixels)
         style.name_first_ordinate(images)
         error, joints, commands = panels(2 * k + 1, 3)
-        error.plot(t, data[f"image_error_px_{name}"], **style.line(style.BLACK))
+        error.plot(t, data[f"error_px_{name}"], **style.line(style.BLACK))
         style.log_scale(error)
         for i in range(len(slides)):
             line = style.curve(i, f"$q_{{{i + 1}}}$")
             joints.plot(t, data[f"q_{name}"][:, i], **line)
             commands.plot(t[:-1], data[f"q_dot_{name}"][:, i], **line)
-        ordinates = "image error (px)", f"joint ({units})", f"velocity ({units} per s)"
+        ordinates = "error (px)", f"joint ({units})", f"velocity ({units} per s)"
         for panel, what in zip((error, joints, commands), ordinates, strict=True):
             panel.set(ylabel=what, xlabel="time (s)")
     style.legend_below(figure, 8)

@@ -2,6 +2,7 @@
 
 import io
 import math
+import textwrap
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from projservo_cli.geometry.kinematics import project
 from projservo_cli.laws import BODY_LAWS, POINT_LAWS, title_of
 from projservo_cli.loop.verdicts import plateau_stretch
-from projservo_cli.records import ByteArray, FloatArray, IntArray, Trace
+from projservo_cli.records import CORNERS, ByteArray, FloatArray, IntArray, Trace
 from projservo_cli.report import style
 from projservo_cli.report.report_data import DIRECT, Data, Driven, ReportData, percent, registered, title
 from projservo_cli.task.face import cyclic_order
@@ -366,7 +367,7 @@ def with_halo(axes: "style.Axes") -> None:
     "Images of the cameras at the start, in the middle and at the end",
     "not in the paper",
     _data_frames,
-    frames=True,
+    shows="frames",
     alt="A row for each camera, with its image at the start, in the middle and at the end. Drawn over "
     "them are the markers that were found, the face with the paths of its markers so far, and the goal.",
 )
@@ -398,6 +399,8 @@ def _draw_frames(data: Data, figure: "style.Figure") -> None:
 
 
 _LEAST_PX = 1e-3  # lowest error that is drawn
+_ARROW = 0.06  # of free motions, over the size of what is drawn
+_FREE = style.line(style.PURPLE, width=1.4)
 _ERRORS_HEIGHT = 3.2  # inches, of the panels of errors with titles and legend
 _LEAST_ASPECT = 0.55  # height over width of an image of features
 
@@ -416,8 +419,14 @@ def _data_incidences(report_data: ReportData | Driven) -> Data:
         "run": np.array(title(name)),
         "free_dof": np.array(-1 if shown.free_dof is None else shown.free_dof),
         "face": shown.s[[0, -1]][:, :, cyclic_order(report_data.plan.A)],
+        "face_at_end": shown.s[-1],
         "view": np.array(shown.view),
         **_feature_images(shown, np.array([0, -1])),
+        **{
+            key: values
+            for key in ("incidence_mm", "incidence_deg", "free_motion", "free_s")
+            if (values := getattr(shown, key)) is not None
+        },
     }
     for name, trace in report_data.traces.items():
         same = np.array_equal(result.get("incidence", trace.incidences), trace.incidences)
@@ -433,9 +442,10 @@ def _data_incidences(report_data: ReportData | Driven) -> Data:
     "Incidences in the images, and their errors",
     "no figure",
     _data_incidences,
-    incidences=True,
-    alt="Above, for each camera: the features of the tool at the start and at the end of a run, and those of "
-    "the scene. Below, for each incidence: its error over time on a logarithmic scale, a curve for each run.",
+    shows="incidences",
+    alt="Above, for each camera: the features of the tool at the start and at the end of a run, those of the "
+    "scene, and how the motions that are left free move the face. Below, for each incidence: its error over "
+    "time on a logarithmic scale, a curve for each run.",
 )
 def _draw_incidences(data: Data, figure: "style.Figure") -> None:
     """Above a panel for each camera, below one for each incidence with a curve for each run."""
@@ -459,6 +469,9 @@ def _draw_incidences(data: Data, figure: "style.Figure") -> None:
         )
         panel.plot(*style.outlines(end).T, **OF_TOOL)
         panel.plot(*style.outlines(data["feature_there"][:, :, view]).T, **OF_SCENE)
+        _draw_free(
+            panel, data, view, _ARROW * np.ptp(pixels[view][np.isfinite(pixels[view][:, 0])], axis=0).max()
+        )
         run = f"{data['run']}, " if not view else ""
         left = f"{free or 'no'} joint motion{'s' * (free != 1)} free" if not view and free >= 0 else ""
         style.image_axes(panel, f"{name} camera" if view else f"{run}{left}\n{name} camera", pixels[view])
@@ -471,9 +484,26 @@ def _draw_incidences(data: Data, figure: "style.Figure") -> None:
             error = np.maximum(data[f"px_{name}"][:, k], _LEAST_PX)
             panel.plot(data[f"t_s_{name}"], error, **style.curve(i, title(name)))
         style.log_scale(panel)
-        panel.set(title=str(incidence), xlabel="time (s)", ylim=(0.5 * lowest, 2.0 * highest))
+        heading = f"{incidence}{_within(data, k)}"
+        panel.set(title=heading, xlabel="time (s)", ylim=(0.5 * lowest, 2.0 * highest))
     panels[0].set_ylabel("error (px at one px of noise)")
     style.legend_below(figure, 4)
+
+
+def _within(data: Data, k: int) -> str:
+    """Error of an incidence as it is stated at the end, in words; empty if it is unknown."""
+    units = ("incidence_mm", " mm"), ("incidence_deg", "°")
+    said = [f"{data[key][k]:.2g}{unit}" for key, unit in units if key in data and np.isfinite(data[key][k])]
+    return f"\nwithin {', '.join(said)}" if said else ""
+
+
+def _draw_free(panel: "style.Axes", data: Data, view: int, length: float) -> None:
+    """Draw at the corners of the face at the end how free motions move them, the farthest by a length, px."""
+    for i, moved in enumerate(data.get("free_s", ())):
+        face, way = data["face_at_end"][view], moved[view]
+        way = way * length / max(float(np.linalg.norm(way, axis=1).max()), 1e-9)
+        ends = np.stack([face - way, face + way], axis=1)
+        panel.plot(*style.outlines(ends).T, **_FREE | ({} if i else {"label": "free motions"}))
 
 
 def _data_sequence(report_data: Driven) -> Data:
@@ -492,7 +522,7 @@ def _data_sequence(report_data: Driven) -> Data:
     "no figure",
     _data_sequence,
     height=3.2,
-    sequence=True,
+    shows="sequence",
     alt="The image error of each motion over time, one after the other, on a logarithmic scale.",
 )
 def _draw_sequence(data: Data, figure: "style.Figure") -> None:
@@ -504,3 +534,57 @@ def _draw_sequence(data: Data, figure: "style.Figure") -> None:
     style.log_scale(panel)
     panel.set(xlabel="time of motion (s)", ylabel="error (px)")
     style.legend_below(figure, 3)
+
+
+# Objects.
+_TAUGHT = style.line(
+    style.GREY, width=1.2, marker="o", markersize=2.5, label="object when the goal was taught"
+)
+_NOW = style.line(style.BLUE, width=1.6, marker="o", markersize=2.5, label="object now")
+_MOVED = style.line(style.ORANGE, width=0.8, label="its displacement")
+_CARRIED = style.line(style.GREEN, width=1.6, label="face at the carried goal")
+
+
+def _data_object(report_data: ReportData | Driven) -> Data:
+    """Images of the object of the goal when it was taught and now, and of the face at the carried goal."""
+    plan, order = report_data.plan, cyclic_order(report_data.plan.A)
+    assert plan.s_object is not None
+    assert plan.s_object_taught is not None
+    assert plan.s_carried is not None
+    return {
+        "about": np.array(plan.object_words),
+        "view": np.array(plan.view),
+        "marker": plan.object_marker if plan.object_marker is not None else np.zeros(0, dtype=np.int64),
+        "taught": plan.s_object_taught,
+        "now": plan.s_object,
+        "face": plan.s_carried[:, order],
+    }
+
+
+@registered(
+    "fig22_object",
+    "The object of the goal, and the goal carried along",
+    "no figure",
+    _data_object,
+    height=4.2,
+    shows="object",
+    alt="For each camera: the tags of the object when the goal was taught and now, the displacement of each "
+    "marker, and the face at the goal that was carried along.",
+)
+def _draw_object(data: Data, figure: "style.Figure") -> None:
+    """A panel for each camera."""
+    names, tags = data["view"], data["marker"] // CORNERS
+    panels = _side_by_side(figure, figure.add_gridspec(1, len(names)), 0, len(names))
+    for view, (panel, name) in enumerate(zip(panels, names, strict=True)):
+        taught, now = data["taught"][view], data["now"][view]
+        moved = np.stack([taught, now], axis=1)
+        panel.plot(*style.outlines(moved[np.isfinite(moved).all(axis=(1, 2))]).T, **_MOVED)
+        for shown, line in ((taught, _TAUGHT), (now, _NOW)):
+            each = [style.outlines(shown[None, tags == tag]) for tag in dict.fromkeys(tags.tolist())]
+            panel.plot(*np.concatenate(each).T, **line)
+        style.face(panel, data["face"][view], _CARRIED)
+        pixels = np.concatenate([taught, now, data["face"][view]])
+        style.image_axes(panel, f"{name} camera", pixels[np.isfinite(pixels).all(axis=1)])
+    style.name_first_ordinate(panels)
+    figure.suptitle(textwrap.fill(str(data["about"]), 90))
+    style.legend_below(figure, 2)
