@@ -22,7 +22,7 @@ from projservo_cli.result_hashes import File
 from projservo_cli.robots.settings import Following, JointSettings, SpeedLimits
 from projservo_cli.settings.disturbance import Disturbance, Events, Faults
 from projservo_cli.settings.features import Feature, Pair
-from projservo_cli.settings.objects import ObjectSettings
+from projservo_cli.settings.objects import WORLD_AND_TOOL, ObjectSettings
 from projservo_cli.simulation.described import (
     arm_of,
     cameras_of,
@@ -243,11 +243,13 @@ def _incidence(pair: Pair, features: Mapping[str, Feature], displaced: StandOff 
     back = "" if displaced is None else f" ({displaced.words})"
     relation = pair[2] if len(pair) == 3 else MEET
     tool, scene = (features[name].flat(features) for name in pair[:2])
+    carried = features[pair[1]].on not in WORLD_AND_TOOL
     if not isinstance(relation, str):
         name = f"{pair[0]} at {relation:g}° to {pair[1]}{back}"
-        return Incidence(name, tool, scene, ANGLE, float(relation))
+        return Incidence(name, tool, scene, ANGLE, float(relation), carried)
     between = {MEET: "on", PARALLEL: "parallel to", PERPENDICULAR: "perpendicular to"}[relation]
-    return Incidence(f"{pair[0]} {between} {pair[1]}{back}", tool, scene, relation)
+    name = f"{pair[0]} {between} {pair[1]}{back}"
+    return Incidence(name, tool, scene, relation, carried=carried)
 
 
 def _displacement(config: Config) -> StandOff | None:
@@ -255,6 +257,12 @@ def _displacement(config: Config) -> StandOff | None:
     along = None if config.task is None else config.task.goal.displaced
     if config.task is None or along is None:
         return None
+    on = {config.features[pair[1]].on for pair in config.task.goal.incidences}
+    if len(on) > 1:
+        raise InputError(
+            f"displaced: the incidences of the goal are on {' and '.join(sorted(on))}, so teach "
+            "the approach as a goal of its own"
+        )
     if config.mount == TOOL:
         raise InputError("displaced: goals of cameras on the tool are not displaced: teach the other goal")
     flat, of_start = config.features[along.along].flat(config.features), config.task.goal.of_start

@@ -212,12 +212,13 @@ def _carried_by(
     plant: PlantSettings,
 ) -> Iterator[Note]:
     """Features that the object of a goal at a path does not carry, and images that do not show it."""
+    held = (carrier,) if goal.on is not None else (carrier, *WORLD_AND_TOOL)
     for i, pair in enumerate(goal.incidences):
-        if pair[1] in features and (on := features[pair[1]].on) != carrier:
+        if pair[1] in features and (on := features[pair[1]].on) not in held:
             yield (
                 (*path, "incidences", i),
-                f"{pair[1]} is on {on}, and the goal on {carrier}, which carries all of it: put {pair[1]} on "
-                f"{carrier}",
+                f"{pair[1]} is on {on}, and the goal on {carrier}: put {pair[1]} on {carrier}"
+                + (", or leave on out, for features on the scene as well" if on == "scene" else ""),
             )
     shown = goal.objects.of(carrier)
     if shown is None and (goal.images is not None or not plant.simulated):

@@ -207,12 +207,12 @@ def _incidences(run: LawRun) -> dict[str, Any]:
         fit = fit_body(model.P, task.body, seen[k], forward(model, run.log.read[k]), SETTLED, normal)
         if fit.settled:
             H[k] = as_array(fit.H)
-    taught = images.displacement_taught(model)
-    left = _incidence_errors(run, images, H[-1], taught)
+    taught = images.displacements_taught(model)
+    left, each = _incidence_errors(run, images, H[-1], taught), np.arange(len(taught))
     flats = [[one.tool for one in images.incidences], [one.scene for one in images.incidences]]
     return {
         "feature_s": images_of(model, task.body.M, flats[0], H),
-        "feature_s_star": images_of(model, task.body.M, flats[1], taught[None])[0],
+        "feature_s_star": images_of(model, task.body.M, flats[1], taught)[each, each],
         "incidence_mm": np.hypot(left.mm, left.deviation_mm),
         "incidence_deg": np.hypot(left.deg, left.deviation_deg),
         "incidence_deviation_mm": left.deviation_mm,
@@ -235,21 +235,29 @@ def _free(run: LawRun, task: Task, H: FloatArray) -> dict[str, Any]:
     return {"free_motion": free, "free_s": np.einsum("vmdj,fj->fvmd", by_joints, free)}
 
 
-def _incidence_errors(
-    run: LawRun, images: TaskImages, H: FloatArray, H_taught: FloatArray
-) -> IncidenceErrors:
-    """State how far incidences are off at the end, where the body is displaced by H (4, 4)."""
+def _incidence_errors(run: LawRun, images: TaskImages, H: FloatArray, taught: FloatArray) -> IncidenceErrors:
+    """State how far incidences (g,) are off at the end, where the body is displaced by H (4, 4).
+
+    taught : (g, 4, 4) displacements of the body where each was taught.
+    """
     scenario, world, plan = run.scenario, run.scenario.world, run.plan
-    carried = plan if isinstance(plan, Plan) and plan.object_name else None
+    on_object = plan if isinstance(plan, Plan) and plan.object_name else None
     s, shown = np.full_like(images.s_star, np.nan), run.log.s[run.steps]
     s[:, : shown.shape[1]] = shown  # of a law that measures points those of the face alone
-    # The images of a goal that was carried along are predicted: its deviation is stated besides.
-    noise_px = (0.0 if carried else scenario.goal_sigma_px), world.noise_px
-    of_goal, now = (np.full(s.shape[:2], max(px, _EXACT_PX)) for px in noise_px)
-    more = (carried.goal_deviation_mm or 0.0, carried.goal_deviation_deg or 0.0) if carried else ()
-    ends = Ends(Look(images.taught().s_star, of_goal), Look(s, now), H_taught, H, *more)
-    markers = world.calibration.indices_of(world.numbers)
-    return errors_of(world.calibration, markers, images.incidences, ends, world.inputs.lengths)
+    now = Look(s, np.full(s.shape[:2], max(world.noise_px, _EXACT_PX)))
+    found, markers = np.full((4, len(taught)), np.nan), world.calibration.indices_of(world.numbers)
+    for carried in {one.carried for one in images.incidences}:
+        own = [k for k, one in enumerate(images.incidences) if one.carried == carried]
+        there = (images.carried() if carried else images.taught()).s_star
+        sigma, more = scenario.goal_sigma_px, tuple[float, ...]()
+        if carried and on_object is not None:  # its images are predicted: their deviation is stated besides
+            sigma = 0.0
+            more = on_object.goal_deviation_mm or 0.0, on_object.goal_deviation_deg or 0.0
+        goal = Look(there, np.full(s.shape[:2], max(sigma, _EXACT_PX)))
+        ends = Ends(goal, now, taught[own[0]], H, *more)
+        asked = [images.incidences[k] for k in own]
+        found[:, own] = errors_of(world.calibration, markers, asked, ends, world.inputs.lengths)
+    return IncidenceErrors(*found)
 
 
 def _stalled_by(run: LawRun) -> Finding:

@@ -92,6 +92,8 @@ class Scenario:
         s : (V, b, 2) its images, px.
         """
         exact = self.exact
+        if self.world.inputs.partly_carried:
+            return replace(self, s_carried=s, goal_joints=self.goal_joints[:0])
         if len(exact.q_near):
             shown = exact._replace(s_star=s)
             exact = exact._replace(q_near=_joints_near_goal(self.world, shown, None))
@@ -185,7 +187,9 @@ class Scenario:
     def images_at(self, seed: int) -> TaskImages:
         """Start and goal as the images of a seed show them; a goal may be carried along, then displaced."""
         images, asked = self.world.shown(self.exact, self.q_taught, seed), self.world.inputs.displaced
-        if self.s_carried is not None:
+        if self.s_carried is not None and self.world.inputs.partly_carried:
+            images = images._replace(s_carried=self.s_carried)
+        elif self.s_carried is not None:
             images = images._replace(s_star=self.s_carried)
         if asked is None:
             return images

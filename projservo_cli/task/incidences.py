@@ -67,6 +67,7 @@ class Incidence(NamedTuple):
     scene: Flat  # the feature of the tool that was there when the goal was taught
     relation: str = MEET
     angle_deg: float = math.nan  # between both, for ``ANGLE``
+    carried: bool = False  # whether the feature of the scene moves with the object of the goal
 
 
 class Incidences(NamedTuple):
@@ -315,14 +316,14 @@ def _has_sense(one: Incidence, tool: FloatArray, scene: FloatArray) -> bool:
 def incidences_of(model: Model, body: Body, H_taught: FloatArray, asked: Sequence[Incidence]) -> Incidences:
     """Rows of incidences, in the frame of a model, not weighted yet.
 
-    H_taught : (4, 4) displacement of the body where the goal was taught.
+    H_taught : (4, 4) displacement of the body where the goal was taught, or (g, 4, 4) one for each incidence.
     Raises InputError for angles whose metric the joints leave open, WorkFailed for points that span no line
     or plane.
     """
     rows, senses = list[FloatArray](), [NO_INCIDENCES.senses]
-    for k, one in enumerate(asked):
+    for k, (one, H) in enumerate(zip(asked, np.broadcast_to(H_taught, (len(asked), 4, 4)), strict=True)):
         tool = points_of(body.M, one.tool)
-        scene = points_of(body.M, one.scene) @ H_taught.T
+        scene = points_of(body.M, one.scene) @ H.T
         for points in (tool, scene):
             if np.linalg.matrix_rank(points / np.linalg.norm(points, axis=1)[:, None], 1e-6) < len(points):
                 raise WorkFailed(

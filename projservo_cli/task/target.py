@@ -73,6 +73,9 @@ class TaskImages(NamedTuple):
     incidences: tuple[Incidence, ...] = ()  # that are to hold at the goal, by positions in the body
     # (V, b, 2) images of the goal as it was taught, px, where that of the incidences is another
     s_taught: FloatArray | None = None
+    # (V, b, 2) images of the goal where its object is now, px, for the incidences that are carried; None
+    # where all of the goal is, or nothing
+    s_carried: FloatArray | None = None
 
     @property
     def pair(self) -> IntArray:
@@ -87,14 +90,18 @@ class TaskImages(NamedTuple):
         """Select the markers of the face, to measure it point by point; incidences need the body."""
         m = self.s_start.shape[1] - self.pins
         s_start, s_star = (np.ascontiguousarray(s[:, :m]) for s in (self.s_start, self.s_star))
-        return self._replace(
-            s_start=s_start, s_star=s_star, pins=0, body=NO_BODY, incidences=(), s_taught=None
-        )
+        face = self._replace(s_start=s_start, s_star=s_star, pins=0, body=NO_BODY)
+        return face._replace(incidences=(), s_taught=None, s_carried=None)
 
     def taught(self) -> "TaskImages":
         """Return the task to the pose that was taught."""
         s_star = self.s_star if self.s_taught is None else self.s_taught
-        return self._replace(s_star=s_star, s_taught=None, incidences=())
+        return self._replace(s_star=s_star, s_taught=None, s_carried=None, incidences=())
+
+    def carried(self) -> "TaskImages":
+        """Return the task to the pose that was taught, where its object is now."""
+        taught = self.taught()
+        return taught if self.s_carried is None else taught._replace(s_star=self.s_carried)
 
     def task(self, model: Model) -> Task:
         """Task of laws with a model, calibrated or metric.
@@ -108,6 +115,12 @@ class TaskImages(NamedTuple):
     def displacement_taught(self, model: Model) -> FloatArray:
         """Displacement (4, 4) of the body where the goal was taught; raises as ``task``."""
         return self.taught()._measured(model)[1]
+
+    def displacements_taught(self, model: Model) -> FloatArray:
+        """Displacements (g, 4, 4) of the body where each incidence was taught; raises as ``task``."""
+        H = self.displacement_taught(model)
+        carried = H if self.s_carried is None else self.carried()._measured(model)[1]
+        return np.array([carried if one.carried else H for one in self.incidences])
 
     def displacement_at_start(self, model: Model) -> FloatArray:
         """Displacement (4, 4) of the body at the start; raises WorkFailed where images do not show it."""
@@ -140,7 +153,8 @@ class TaskImages(NamedTuple):
 
     def _rows(self, model: Model, task: Task, H_star: FloatArray) -> Incidences:
         """Rows of the incidences by a task to the goal (4, 4), or to one that was taught elsewhere."""
-        H_taught = H_star if self.s_taught is None else self.displacement_taught(model)
+        whole = self.s_taught is None and self.s_carried is None
+        H_taught = H_star if whole else self.displacements_taught(model)
         rows = incidences_of(model, task.body, H_taught, self.incidences)
         A = np.ascontiguousarray(task.body.M[: len(task.A_star)])
         face = np.array(face_plane(A, task.order, center_of(A, task.center)))

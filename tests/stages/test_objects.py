@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from projservo_cli.records import WorkFailed
+from projservo_cli.records import InputError, WorkFailed
 from projservo_cli.report.report_data import REGISTER, Driven
 from tests.configured import calibrate, plan, servo, truth_of
 from tests.known import configured
@@ -88,6 +88,49 @@ def test_incidences_on_an_object_are_met_where_it_is_now():
     tip = (pin @ H.T)[1, :3]
     assert np.linalg.norm(tip - there[1]) < 3e-3 * planned.goal_deviation_mm
     assert trace.position_error_mm < 3.0 * planned.goal_deviation_mm
+
+
+def test_a_part_and_the_scene_are_in_one_goal():
+    """The pin in a hole of a part that has moved, its tip on a plane of the scene that has not."""
+    middle = np.array([0.55, 0.1, 0.45])
+    block = {
+        "markers": [*range(40, 46)],
+        "positions_m": (middle + 0.04 * np.random.default_rng(1).standard_normal((6, 3))).tolist(),
+        "displacement": {"translation_m": [-0.02, 0.03, 0.01], "rotation_deg": [4.0, -5.0, 8.0]},
+    }
+    table = {"side": {"on": "tool", "plane": [0, 1, 10]}, "table": {"on": "scene", "plane": "side"}}
+    config = configured(
+        "insertion",
+        f"objects.block={json.dumps(block)}",
+        "features.hole.on=block",
+        *(f"features.{name}={json.dumps(one)}" for name, one in table.items()),
+        "task.goal.incidences=[[pin, hole], [tip, table]]",
+    )
+    calibration = calibrate.run(config)[1]
+    planned, truth = plan.run(config, calibration), truth_of(config)
+    assert planned.incidences == ("pin on hole", "tip on table")
+    q_goal = config.task.goal.joints.values(config.joint_types)
+    taught, T = truth.displacement(q_goal), config.objects.named["block"].moved
+    pin, side = truth.of((10, 11)), truth.of((0, 1, 10))
+    hole, plane = (pin @ (T @ taught).T)[:, :3], (side @ taught.T)[:, :3]
+    along, normal = hole[1] - hole[0], np.cross(plane[1] - plane[0], plane[2] - plane[0])
+    for law in ("exact_track", "incidences"):
+        trace = servo.run(config, calibration, planned, law)
+        assert (trace.verdict, trace.success, trace.free_dof) == ("converged", True, 1), trace.reason
+        ends = (pin @ (trace.pose[-1] @ np.linalg.inv(truth.robot.base_tool)).T)[:, :3]
+        beside = np.linalg.norm(np.cross(ends - hole[0], along), axis=1).max() / np.linalg.norm(along)
+        above = abs((ends[1] - plane[0]) @ normal) / np.linalg.norm(normal)
+        assert (1e3 * np.array([beside, above]) < 2.0 * trace.incidence_mm).all()
+        assert trace.incidence_mm.max() < 1.5 * planned.goal_deviation_mm
+    # What carries the hole does not carry the table.
+    assert trace.incidence_deviation_mm[0] > planned.goal_deviation_mm > trace.incidence_deviation_mm[1]
+    with pytest.raises(
+        InputError, match="are on block and scene, so teach the approach as a goal of its own"
+    ):
+        plan.run(
+            config.replace({"task.goal.displaced": {"along": "pin", "by_m": 0.05}}),
+            calibration,
+        )
 
 
 REFUSED = [

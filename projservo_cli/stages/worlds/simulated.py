@@ -83,14 +83,20 @@ class SimulatedWorld(CalibratedWorld):
 
     def true_ends(self, images: TaskImages, q_goal: FloatArray | None) -> Ends:
         """Return the true poses of the tool at start and goal, which may be carried along, then displaced."""
-        truth, carrier = self.truth, self.inputs.carrier
+        truth = self.truth
         if q_goal is None:
             return Ends(truth.robot.base_tool, np.full((4, 4), np.nan), np.full(4, np.nan))
         found = truth.ends(q_goal)
-        if carrier is not None and carrier.placed is not None:
-            T = carrier.placed.T
+        if not self.inputs.partly_carried:
+            T = self._carried
             found = found._replace(goal_pose=T @ found.goal_pose, goal=T @ found.goal)
         return self._displaced(images, found)
+
+    @property
+    def _carried(self) -> FloatArray:
+        """Displacement (4, 4) of the object of the goal since it was taught; of none without one."""
+        carrier = self.inputs.carrier
+        return np.eye(4) if carrier is None or carrier.placed is None else carrier.placed.T
 
     def _displaced(self, images: TaskImages, ends: Ends) -> Ends:
         """Return the true ends of a task with its goal displaced, if that is asked for."""
@@ -109,11 +115,13 @@ class SimulatedWorld(CalibratedWorld):
         if not images.incidences or not np.isfinite(ends.goal_pose).all():
             return ends
         truth, on_tool = self.truth, plant.model.on_tool
-        H_taught, body = (
-            ends.goal_pose @ np.linalg.inv(ends.base_tool),
+        H_taught = ends.goal_pose @ np.linalg.inv(ends.base_tool)
+        at, body = (
+            np.linalg.inv(H_taught) if on_tool else H_taught,
             make_body(truth.model, truth.of(self.numbers)),
         )
-        at = np.linalg.inv(H_taught) if on_tool else H_taught
+        if self.inputs.partly_carried:
+            at = np.array([self._carried @ at if one.carried else at for one in images.incidences])
         rows = incidences_of(truth.model, body, at, images.incidences)
         H = nearest_goal(rows, body, H, _point_velocities)
         pose = (np.linalg.inv(H) if on_tool else H) @ ends.base_tool
