@@ -55,7 +55,7 @@ def carried_goal(
         return scenario.carried(before.s_carried), known
     c = scenario.world.calibration
     metric, _ = in_metres(c, carrier.lengths)
-    taught, now = scenario.world.look(carrier, session, scenario.exact.q_start, scenario.q_taught)
+    taught, now = scenario.world.look(carrier, session, scenario.exact, scenario.q_taught)
     try:
         found = DisplacedObject.of(c, carrier.numbers, [taught, now], metric)
         goal = found.carry(_goal(scenario, c))

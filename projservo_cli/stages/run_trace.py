@@ -34,7 +34,7 @@ from projservo_cli.simulation.faults import obstruction_of
 from projservo_cli.stages.law_run import LawRun
 from projservo_cli.task.body import SETTLED, fit_body
 from projservo_cli.task.face import Task
-from projservo_cli.task.incidence_errors import Ends, IncidenceErrors, errors_of
+from projservo_cli.task.incidence_errors import IncidenceErrors, TaughtAndNow, incidence_errors
 from projservo_cli.task.incidences import (
     errors_px,
     free_motions,
@@ -254,9 +254,9 @@ def _incidence_errors(run: LawRun, images: TaskImages, H: FloatArray, taught: Fl
             sigma = 0.0
             more = on_object.goal_deviation_mm or 0.0, on_object.goal_deviation_deg or 0.0
         goal = Look(there, np.full(s.shape[:2], max(sigma, _EXACT_PX)))
-        ends = Ends(goal, now, taught[own[0]], H, *more)
+        ends = TaughtAndNow(goal, now, taught[own[0]], H, *more)
         asked = [images.incidences[k] for k in own]
-        found[:, own] = errors_of(world.calibration, markers, asked, ends, world.inputs.lengths)
+        found[:, own] = incidence_errors(world.calibration, markers, asked, ends, world.inputs.lengths)
     return IncidenceErrors(*found)
 
 

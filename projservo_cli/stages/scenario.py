@@ -37,8 +37,8 @@ from projservo_cli.simulation.analytic_plant import Ends, Plant
 from projservo_cli.simulation.workspace import Truth
 from projservo_cli.stages.stage_inputs import PlanInputs, ServoInputs
 from projservo_cli.stages.worlds.calibrated import CalibratedWorld, measures_points, observed_numbers
-from projservo_cli.stages.worlds.images import in_body, positioned, unseen
 from projservo_cli.stages.worlds.simulated import RenderedWorld, SimulatedWorld
+from projservo_cli.stages.worlds.task_images import in_body, positioned, unseen
 from projservo_cli.task.incidences import Incidence
 from projservo_cli.task.stand_off import displacement_back
 from projservo_cli.task.target import TaskImages, is_stereo

@@ -76,7 +76,7 @@ def angle_off(one: Incidence, tool: FloatArray, scene: FloatArray) -> float:
     return float(abs(between - _wanted(one)))
 
 
-class Ends(NamedTuple):
+class TaughtAndNow(NamedTuple):
     """Where a goal was taught, and where the tool is: images (V, k, 2), and displacements to begin with."""
 
     taught: Look
@@ -148,7 +148,7 @@ def metric_rig(c: Calibration) -> LookRig | None:
     return rig if rig.rigid else None
 
 
-def placed_by(rig: LookRig, markers: Sequence[int], ends: Ends, unit_mm: FloatArray) -> Placed:
+def placed_by(rig: LookRig, markers: Sequence[int], ends: TaughtAndNow, unit_mm: FloatArray) -> Placed:
     """Fit both poses of the body to their images."""
     M, back = rig.M[:, list(markers)], np.linalg.inv(rig.G)
     E = generators(rig.turns, M[0, :, :3].mean(axis=0))
@@ -169,8 +169,12 @@ def mm_a_unit(M: FloatArray, lengths: FloatArray) -> FloatArray:
     return np.asarray(MM * np.median(lengths[i, k] / apart, axis=1))
 
 
-def errors_of(
-    c: Calibration, markers: Sequence[int], asked: Sequence[Incidence], ends: Ends, lengths: FloatArray
+def incidence_errors(
+    c: Calibration,
+    markers: Sequence[int],
+    asked: Sequence[Incidence],
+    ends: TaughtAndNow,
+    lengths: FloatArray,
 ) -> IncidenceErrors:
     """State how far features are from where incidences want them; NaN where the joints leave the metric open.
 

@@ -7,10 +7,10 @@ from scipy.spatial.transform import Rotation
 from projservo_cli.metric.frame import changes_of
 from projservo_cli.records import ANGLE, MEET, PARALLEL, PERPENDICULAR
 from projservo_cli.task.incidence_errors import (
-    Ends,
     Separation,
+    TaughtAndNow,
     angle_off,
-    errors_of,
+    incidence_errors,
     metric_rig,
     mm_a_unit,
     placed_by,
@@ -75,13 +75,13 @@ def placed():
     markers = calibration.indices_of(truth.number)
     G = np.linalg.lstsq(truth.M, calibration.M[markers], rcond=None)[0].T
     H_taught, H_now = (G @ one @ np.linalg.inv(G) for one in H)
-    ends = Ends(Look(taught, sigma), Look(now, sigma), H_taught, H_now)
+    ends = TaughtAndNow(Look(taught, sigma), Look(now, sigma), H_taught, H_now)
     return calibration, markers, ends, config.markers.lengths(config.face_numbers), truth, H
 
 
 def test_errors_are_those_of_the_truth_within_their_deviation(placed):
     calibration, markers, ends, lengths, truth, (H_taught, H_now) = placed
-    found = errors_of(calibration, markers, ASKED, ends, lengths)
+    found = incidence_errors(calibration, markers, ASKED, ends, lengths)
     for k, one in enumerate(ASKED):
         A, B = (
             (np.array([truth.M[list(at)].mean(axis=0) for at in flat]) @ H.T)[:, :3]
@@ -100,8 +100,8 @@ def test_errors_are_those_of_the_truth_within_their_deviation(placed):
         else:
             assert np.isnan(found.deg[k])
     nowhere = ends._replace(H=np.full((4, 4), np.nan))
-    assert np.isnan(errors_of(calibration, markers, ASKED, nowhere, lengths)).all()
-    unknown = errors_of(calibration, markers, ASKED, ends, np.full_like(lengths, np.nan))
+    assert np.isnan(incidence_errors(calibration, markers, ASKED, nowhere, lengths)).all()
+    unknown = incidence_errors(calibration, markers, ASKED, ends, np.full_like(lengths, np.nan))
     assert np.isnan(unknown.mm).all()
     assert unknown.deg == pytest.approx(found.deg, nan_ok=True)
 

@@ -35,7 +35,7 @@ from projservo_cli.simulation.analytic_plant import Ends, Plant
 from projservo_cli.simulation.workspace import turned
 from projservo_cli.stages.external_robot import opened_robot, path_to
 from projservo_cli.stages.stage_inputs import CarryingObject, Contract, PlanInputs
-from projservo_cli.stages.worlds.images import look_taught, task_images
+from projservo_cli.stages.worlds.task_images import look_taught, task_images
 from projservo_cli.task.body import NO_BODY, Body, make_body
 from projservo_cli.task.look_bundle import Look
 from projservo_cli.task.target import TaskImages, is_stereo
@@ -169,18 +169,21 @@ class CalibratedWorld:
         return images
 
     def look(
-        self,
-        carrier: CarryingObject,
-        session: Session | None,
-        q_start: FloatArray,
-        q_taught: FloatArray | None,
+        self, carrier: CarryingObject, session: Session | None, ends: TaskImages, q_taught: FloatArray | None
     ) -> tuple[Look, Look]:
-        """Images of an object when the goal was taught, and now, by the robot where it stands.
+        """Images of an object when the goal was taught, and now.
 
-        session : connection to it; None for one of its own.
+        session : connection to the robot that looks where it stands; None for one of its own.
+        q_taught : (n,) joints at which the goal was taught, if they are known.
         """
+        now = self._look_now(carrier, session, ends.q_start)
+        if carrier.taught is None:
+            return self._look_before(carrier, q_taught), now
+        return look_taught(carrier, carrier.taught, self.view), now
+
+    def _look_now(self, carrier: CarryingObject, session: Session | None, q_start: FloatArray) -> Look:
+        """Images of an object by the robot where it stands, or by a simulated one at the start (n,)."""
         assert carrier.driven is not None
-        assert carrier.taught is not None
         with nullcontext(session) if session else Session() as own:
             known = self.joints, self.observed, self.view
             robot = opened_robot(own, carrier.driven, *known).robot
@@ -191,7 +194,11 @@ class CalibratedWorld:
 
             _, mean, sigma, *_ = seen_at_rest(robot, observe, carrier.frames, carrier.settle_s, "plan")
         which = [len(self.observed) + carrier.driven.further.index(number) for number in carrier.numbers]
-        return look_taught(carrier, carrier.taught, self.view), Look(mean.s[:, which], sigma[:, which])
+        return Look(mean.s[:, which], sigma[:, which])
+
+    def _look_before(self, carrier: CarryingObject, q_taught: FloatArray | None) -> Look:
+        """Images of an object when the goal was taught, of which none were kept; of simulated ones alone."""
+        raise InputError(f"task.goal does not show where {carrier.name} was: teach it again, projservo teach")
 
     def metric_model(self, law: str) -> Model:
         """Return the metric model that a classical law is given; InputError where none is described."""

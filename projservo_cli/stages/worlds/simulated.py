@@ -45,7 +45,7 @@ from projservo_cli.simulation.workspace import SceneObject, Truth, plant_of, tur
 from projservo_cli.stages.external_robot import simulated_robot
 from projservo_cli.stages.stage_inputs import CarryingObject, Contract
 from projservo_cli.stages.worlds.calibrated import CalibratedWorld, TruePoses
-from projservo_cli.stages.worlds.images import look_taught, positioned, task_images
+from projservo_cli.stages.worlds.task_images import positioned, task_images
 from projservo_cli.task.body import make_body
 from projservo_cli.task.face import center_of
 from projservo_cli.task.incidences import incidences_of, nearest_goal
@@ -142,19 +142,13 @@ class SimulatedWorld(CalibratedWorld):
             s[:drawn, :, m:] += sigma * noise[:, :, which]
         return images._replace(s_start=s[0], s_star=s[1])
 
-    def look(
-        self,
-        carrier: CarryingObject,
-        session: Session | None,
-        q_start: FloatArray,
-        q_taught: FloatArray | None,
-    ) -> tuple[Look, Look]:
-        """Images of an object when the goal was taught, and now."""
+    def _look_now(self, carrier: CarryingObject, session: Session | None, q_start: FloatArray) -> Look:
         assert carrier.placed is not None
-        now = self._object(carrier.placed, OBJECT_NOW, carrier.placed.T)
-        if carrier.taught is not None:
-            return look_taught(carrier, carrier.taught, self.view), now
-        return self._object(carrier.placed, OBJECT_TAUGHT, np.eye(4)), now
+        return self._object(carrier.placed, OBJECT_NOW, carrier.placed.T)
+
+    def _look_before(self, carrier: CarryingObject, q_taught: FloatArray | None) -> Look:
+        assert carrier.placed is not None
+        return self._object(carrier.placed, OBJECT_TAUGHT, np.eye(4))
 
     def _object(self, placed: SceneObject, stream: int, T: FloatArray) -> Look:
         """Images of an object displaced by T (4, 4) since the goal was taught."""
@@ -306,20 +300,13 @@ class RenderedWorld(SimulatedWorld):
             "little else of the tool: turn it towards the cameras, or bring it nearer"
         )
 
-    def look(
-        self,
-        carrier: CarryingObject,
-        session: Session | None,
-        q_start: FloatArray,
-        q_taught: FloatArray | None,
-    ) -> tuple[Look, Look]:
-        """Images of an object when the goal was taught, and now."""
-        now = self._object_frames(carrier, self.scene, q_start, OBJECT_NOW)
-        if carrier.taught is not None:
-            return look_taught(carrier, carrier.taught, self.view), now
+    def _look_now(self, carrier: CarryingObject, session: Session | None, q_start: FloatArray) -> Look:
+        return self._object_frames(carrier, self.scene, q_start, OBJECT_NOW)
+
+    def _look_before(self, carrier: CarryingObject, q_taught: FloatArray | None) -> Look:
         assert carrier.at_first is not None
         assert q_taught is not None
-        return self._object_frames(carrier, carrier.at_first, q_taught, OBJECT_TAUGHT), now
+        return self._object_frames(carrier, carrier.at_first, q_taught, OBJECT_TAUGHT)
 
     def _object_frames(
         self, carrier: CarryingObject, scene: RenderedScene, q: FloatArray, stream: int
