@@ -63,7 +63,7 @@ class Case:
         self.noise = NOISE_PX * np.random.default_rng(0).standard_normal((STATES, *seen))
         self.whole = self._run(shown.task(self.model), scenario.plant_of("exact"))
         self.points = self._run(shown.by_points().task(self.model), scenario.plant_of("stacked"))
-        posed = shown._replace(incidences=whole_pose(shown.body.M[: self.m]))
+        posed = shown.asking(whole_pose(shown.body.M[: self.m]))
         self.incidences = self._run(posed.task(self.model), scenario.plant_of("exact"))
         self.law = BuiltInLaw(CODE, *self.points.law[2:])
 

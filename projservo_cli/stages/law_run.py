@@ -99,7 +99,7 @@ class LawRun:
         """Name and unit of the error that decides convergence, as words have them."""
         if self.own_tolerance is not None:
             return "error of the law", ""
-        if self.scenario.exact.incidences and not math.isnan(float(self.log.fit[self.steps, 2])):
+        if self.scenario.exact.goal.incidences and not math.isnan(float(self.log.fit[self.steps, 2])):
             return "error of the incidences", "px"
         return "image error", "px"
 
@@ -207,13 +207,13 @@ class LawRun:
         Raises InputError for such a law without a body.
         """
         images = self.scenario.images_for(self.law)
-        if self.law != INCIDENCES or images.incidences:
+        if self.law != INCIDENCES or images.goal.incidences:
             return images
         if not len(images.body.M):
             raise InputError(
                 f"{self.law} measures with the body: leave control.features: points out, and calibrate well"
             )
-        return images._replace(incidences=whole_pose(images.body.M[: self.scenario.world.m]))
+        return images.asking(whole_pose(images.body.M[: self.scenario.world.m]))
 
     def _built_in(self) -> BuiltInLaw:
         """The built-in law with the model that it is given, and the sense of its rotations."""

@@ -172,8 +172,8 @@ def _to_any_goal(scenario: Scenario) -> Plan:
     Raises WorkFailed where no joints meet all incidences, with those that fail, or no motion leads to a goal.
     """
     model, ends = scenario.world.model, scenario.ends
-    H_taught, shows = ends.displacements_taught(model), np.isfinite(ends.taught().s_star[..., 0])
-    asked, sigma_px = ends.incidences, scenario.goal_error_px
+    H_taught, shows = ends.displacements_taught(model), np.isfinite(ends.s_star[..., 0])
+    asked, sigma_px = ends.goal.incidences, scenario.goal_error_px
     apart = tuple(contradictions(model, ends.body, H_taught, asked, shows, sigma_px))
     if not usable(apart):
         raise failed([one for one in apart if one.severity == REFUSES])

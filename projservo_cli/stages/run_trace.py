@@ -149,7 +149,7 @@ def _stated_mm(run: LawRun, views: FloatArray) -> dict[str, Any]:
     Nothing if no length on the face is known, or images disagree with the calibration.
     """
     scenario, calibration, m = run.scenario, run.scenario.world.calibration, run.scenario.world.m
-    if scenario.exact.incidences:  # from one goal of many
+    if scenario.exact.goal.incidences:  # from one goal of many
         return {}
     noise = [_LEAST_NOISE_PX, scenario.world.noise_px, calibration.sigma_px]
     left = _rms(run.log.fit[run.steps, 1:2], 2.0 * views[-1:] - COORDINATES)[0]
@@ -198,7 +198,7 @@ def _rms(squares: FloatArray, count: FloatArray) -> FloatArray:
 def _incidences(run: LawRun) -> dict[str, Any]:
     """Names of the incidences, their errors at each time, px, and the freedoms that they leave."""
     scenario, images = run.scenario, run.scenario.ends
-    if not images.incidences:
+    if not images.goal.incidences:
         return {}
     task, model = images.task(scenario.world.model), scenario.world.model
     seen, normal = undistort(model.lens, run.log.s), np.zeros((COORDINATES, COORDINATES + 1))
@@ -209,7 +209,7 @@ def _incidences(run: LawRun) -> dict[str, Any]:
             H[k] = as_array(fit.H)
     taught = images.displacements_taught(model)
     left, each = _incidence_errors(run, images, H[-1], taught), np.arange(len(taught))
-    flats = [[one.tool for one in images.incidences], [one.scene for one in images.incidences]]
+    flats = [[one.tool for one in images.goal.incidences], [one.scene for one in images.goal.incidences]]
     return {
         "feature_s": images_of(model, task.body.M, flats[0], H),
         "feature_s_star": images_of(model, task.body.M, flats[1], taught)[each, each],
@@ -217,7 +217,7 @@ def _incidences(run: LawRun) -> dict[str, Any]:
         "incidence_deg": np.hypot(left.deg, left.deviation_deg),
         "incidence_deviation_mm": left.deviation_mm,
         "incidence_deviation_deg": left.deviation_deg,
-        "incidences": tuple(one.name for one in images.incidences),
+        "incidences": tuple(one.name for one in images.goal.incidences),
         "incidence_px": errors_px(task.incidences, H),
         "free_dof": run.plan.free_dof if isinstance(run.plan, Plan) else None,
         **_free(run, task, H[-1]),
@@ -246,16 +246,16 @@ def _incidence_errors(run: LawRun, images: TaskImages, H: FloatArray, taught: Fl
     s[:, : shown.shape[1]] = shown  # of a law that measures points those of the face alone
     now = Look(s, np.full(s.shape[:2], max(world.noise_px, _EXACT_PX)))
     found, markers = np.full((4, len(taught)), np.nan), world.calibration.indices_of(world.numbers)
-    for carried in {one.carried for one in images.incidences}:
-        own = [k for k, one in enumerate(images.incidences) if one.carried == carried]
-        there = (images.carried() if carried else images.taught()).s_star
+    for carried in {one.carried for one in images.goal.incidences}:
+        own = [k for k, one in enumerate(images.goal.incidences) if one.carried == carried]
+        there = images.goal.carried if carried else images.goal.taught
         sigma, more = scenario.goal_sigma_px, tuple[float, ...]()
         if carried and on_object is not None:  # its images are predicted: their deviation is stated besides
             sigma = 0.0
             more = on_object.goal_deviation_mm or 0.0, on_object.goal_deviation_deg or 0.0
         goal = Look(there, np.full(s.shape[:2], max(sigma, _EXACT_PX)))
         ends = TaughtAndNow(goal, now, taught[own[0]], H, *more)
-        asked = [images.incidences[k] for k in own]
+        asked = [images.goal.incidences[k] for k in own]
         found[:, own] = incidence_errors(world.calibration, markers, asked, ends, world.inputs.lengths)
     return IncidenceErrors(*found)
 
@@ -338,7 +338,7 @@ def _vague(run: LawRun) -> Iterator[Finding]:
 def _apart(run: LawRun) -> Iterator[Finding]:
     """Tell that the face as it is seen is off by more than noise, though the whole body is not."""
     displaced = run.scenario.world.inputs.displaced  # to where it was never seen
-    if run.scenario.exact.incidences or displaced:  # the face may be anywhere that they leave open
+    if run.scenario.exact.goal.incidences or displaced:  # the face may be anywhere that they leave open
         return
     limits = run.scenario.termination
     by_noise = limits.image_error_px + (run.noise_ratio - 1.0) * limits.noise_px

@@ -63,7 +63,7 @@ class Scenario:
         images = self.images_at(self.world.inputs.seed)
         if self.s_chosen is None:
             return images
-        return images._replace(s_star=self.s_chosen, s_taught=images.s_star)
+        return images._replace(goal=images.goal._replace(s=self.s_chosen))
 
     @property
     def untested(self) -> tuple[Finding, ...]:
@@ -92,10 +92,8 @@ class Scenario:
         s : (V, b, 2) its images, px.
         """
         exact = self.exact
-        if self.world.inputs.partly_carried:
-            return replace(self, s_carried=s, goal_joints=self.goal_joints[:0])
         if len(exact.q_near):
-            shown = exact._replace(s_star=s)
+            shown = exact._replace(goal=exact.goal.carried_to(s))
             exact = exact._replace(q_near=_joints_near_goal(self.world, shown, None))
         return replace(self, s_carried=s, exact=exact, goal_joints=self.goal_joints[:0])
 
@@ -187,10 +185,8 @@ class Scenario:
     def images_at(self, seed: int) -> TaskImages:
         """Start and goal as the images of a seed show them; a goal may be carried along, then displaced."""
         images, asked = self.world.shown(self.exact, self.q_taught, seed), self.world.inputs.displaced
-        if self.s_carried is not None and self.world.inputs.partly_carried:
-            images = images._replace(s_carried=self.s_carried)
-        elif self.s_carried is not None:
-            images = images._replace(s_star=self.s_carried)
+        if self.s_carried is not None:
+            images = images._replace(goal=images.goal.carried_to(self.s_carried))
         if asked is None:
             return images
         if not len(images.body.M):
@@ -200,11 +196,11 @@ class Scenario:
             )
         model, back = self.world.model, positioned(asked, self.world.numbers)
         s = images.s_start if asked.of_start else images.s_star
-        H = images.displacement_at_start(model) if asked.of_start else images.displacement_taught(model)
+        H = images.displacement_at_start(model) if asked.of_start else images.displacement_at_goal(model)
         metre = metres_a_unit(model, images.body.M[: self.world.m], self.world.inputs.lengths)
         moved = displacement_back(model, images.body, H, back, np.isfinite(s[..., 0]), metre) @ H
         there, before = (project(model.P, images.body.M @ at.T, model.lens) for at in (moved, H))
-        return images._replace(s_star=np.ascontiguousarray(there + s - before))
+        return images.to(np.ascontiguousarray(there + s - before))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -281,8 +277,8 @@ def scenario_of(inputs: PlanInputs, calibration: Calibration) -> Scenario:
             "set control.features: body to try"
         )
     exact, q_goal = world.ends(task)
-    incidences = _positions(inputs.incidences, world.numbers)
-    exact = exact._replace(body=world.body, view=world.view, incidences=incidences)
+    exact = exact._replace(body=world.body, view=world.view)
+    exact = exact.asking(_positions(inputs.incidences, world.numbers))
     if not is_stereo(world.view):
         exact = exact._replace(q_near=_joints_near_goal(world, exact, q_goal))
     exact = exact._replace(least_views=world.least_views)

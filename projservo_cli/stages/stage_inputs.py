@@ -225,11 +225,6 @@ class PlanInputs:
     displaced: StandOff | None = None  # of the goal, or of the start in its place
     q_current: FloatArray | None = None  # (n,) joints where the arm stands, rad or m, once that is known
 
-    @property
-    def partly_carried(self) -> bool:
-        """Whether an object carries some of the incidences, and others stand still."""
-        return len({one.carried for one in self.incidences}) > 1
-
     def cameras_at(self, q: FloatArray) -> FloatArray | None:
         """Cameras (V, 3, 4) from the base frame at joints (n,), rad or m, px; None if not described."""
         if self.arm is None or self.P is None:

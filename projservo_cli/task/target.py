@@ -57,12 +57,38 @@ def is_stereo(view: Sequence[str]) -> bool:
     return len(view) == len(VIEWS)
 
 
+class Goal(NamedTuple):
+    """What is to hold at the end: incidences, each where its carrier has it, or the whole pose of the face.
+
+    Its images are those of the body at the pose that was taught.
+    """
+
+    taught: FloatArray  # (V, b, 2) px where it was taught, on the scene
+    carried: FloatArray  # (V, b, 2) px where its object has it now; as taught without one
+    s: FloatArray  # (V, b, 2) px at the pose to drive to: of incidences the one that was chosen
+    incidences: tuple[Incidence, ...] = ()  # by positions in the body; none for the whole pose
+
+    @classmethod
+    def at(cls, s: FloatArray, incidences: tuple[Incidence, ...] = ()) -> "Goal":
+        """Return the goal that images (V, b, 2) show, and nothing carries."""
+        return cls(s, s, s, incidences)
+
+    @property
+    def partly_carried(self) -> bool:
+        """Whether an object carries some of the incidences, and others stand still."""
+        return len({one.carried for one in self.incidences}) > 1
+
+    def carried_to(self, s: FloatArray) -> "Goal":
+        """Return the goal with its object where it is now; all of it goes along, unless some stands still."""
+        return self._replace(carried=s, s=self.s if self.partly_carried else s)
+
+
 class TaskImages(NamedTuple):
     """Images at start and goal of a task: teaching by showing."""
 
     q_start: FloatArray  # (n,) joint readings at the start, rad or m, with the offset if there is one
     s_start: FloatArray  # (V, b, 2) px of the face, then of its pins, at the start; NaN if unknown
-    s_star: FloatArray  # (V, b, 2) px at the goal
+    goal: Goal
     center: int  # index of the centre marker within the face, or ``MIDPOINT``
     pins: int = 0  # number of markers that are not on the face
     body: Body = NO_BODY  # of all markers, to measure with; none to measure point by point
@@ -70,12 +96,19 @@ class TaskImages(NamedTuple):
     least_views: int = 0  # number of views that are to see the face, 0 for all
     # (n,) joints near those of the goal, rad or m, which predict its pose where no pair of views shows it
     q_near: FloatArray = np.zeros(0)
-    incidences: tuple[Incidence, ...] = ()  # that are to hold at the goal, by positions in the body
-    # (V, b, 2) images of the goal as it was taught, px, where that of the incidences is another
-    s_taught: FloatArray | None = None
-    # (V, b, 2) images of the goal where its object is now, px, for the incidences that are carried; None
-    # where all of the goal is, or nothing
-    s_carried: FloatArray | None = None
+
+    @property
+    def s_star(self) -> FloatArray:
+        """Images (V, b, 2) at the pose to drive to, px."""
+        return self.goal.s
+
+    def to(self, s: FloatArray) -> "TaskImages":
+        """Return the task to where images (V, b, 2) show the goal."""
+        return self._replace(goal=Goal.at(s, self.goal.incidences))
+
+    def asking(self, incidences: tuple[Incidence, ...]) -> "TaskImages":
+        """Return the task with other incidences; without any for the whole pose."""
+        return self._replace(goal=self.goal._replace(incidences=incidences))
 
     @property
     def pair(self) -> IntArray:
@@ -90,18 +123,7 @@ class TaskImages(NamedTuple):
         """Select the markers of the face, to measure it point by point; incidences need the body."""
         m = self.s_start.shape[1] - self.pins
         s_start, s_star = (np.ascontiguousarray(s[:, :m]) for s in (self.s_start, self.s_star))
-        face = self._replace(s_start=s_start, s_star=s_star, pins=0, body=NO_BODY)
-        return face._replace(incidences=(), s_taught=None, s_carried=None)
-
-    def taught(self) -> "TaskImages":
-        """Return the task to the pose that was taught."""
-        s_star = self.s_star if self.s_taught is None else self.s_taught
-        return self._replace(s_star=s_star, s_taught=None, s_carried=None, incidences=())
-
-    def carried(self) -> "TaskImages":
-        """Return the task to the pose that was taught, where its object is now."""
-        taught = self.taught()
-        return taught if self.s_carried is None else taught._replace(s_star=self.s_carried)
+        return self._replace(s_start=s_start, goal=Goal.at(s_star), pins=0, body=NO_BODY)
 
     def task(self, model: Model) -> Task:
         """Task of laws with a model, calibrated or metric.
@@ -110,17 +132,18 @@ class TaskImages(NamedTuple):
         a view; with a body, if a motion is not unique or the markers do not fit a pose of the body.
         """
         task, H_star = self._measured(model)
-        return task._replace(incidences=self._rows(model, task, H_star)) if self.incidences else task
+        return task._replace(incidences=self._rows(model, task, H_star)) if self.goal.incidences else task
 
-    def displacement_taught(self, model: Model) -> FloatArray:
-        """Displacement (4, 4) of the body where the goal was taught; raises as ``task``."""
-        return self.taught()._measured(model)[1]
+    def displacement_at_goal(self, model: Model) -> FloatArray:
+        """Displacement (4, 4) of the body at the pose to drive to; raises as ``task``."""
+        return self._measured(model)[1]
 
     def displacements_taught(self, model: Model) -> FloatArray:
         """Displacements (g, 4, 4) of the body where each incidence was taught; raises as ``task``."""
-        H = self.displacement_taught(model)
-        carried = H if self.s_carried is None else self.carried()._measured(model)[1]
-        return np.array([carried if one.carried else H for one in self.incidences])
+        goal = self.goal
+        asked = {one.carried: goal.carried if one.carried else goal.taught for one in goal.incidences}
+        H = {carried: self.to(s).displacement_at_goal(model) for carried, s in asked.items()}
+        return np.array([H[one.carried] for one in goal.incidences])
 
     def displacement_at_start(self, model: Model) -> FloatArray:
         """Displacement (4, 4) of the body at the start; raises WorkFailed where images do not show it."""
@@ -152,10 +175,8 @@ class TaskImages(NamedTuple):
         return task, H_star
 
     def _rows(self, model: Model, task: Task, H_star: FloatArray) -> Incidences:
-        """Rows of the incidences by a task to the goal (4, 4), or to one that was taught elsewhere."""
-        whole = self.s_taught is None and self.s_carried is None
-        H_taught = H_star if whole else self.displacements_taught(model)
-        rows = incidences_of(model, task.body, H_taught, self.incidences)
+        """Rows of the incidences by a task to the goal (4, 4)."""
+        rows = incidences_of(model, task.body, self.displacements_taught(model), self.goal.incidences)
         A = np.ascontiguousarray(task.body.M[: len(task.A_star)])
         face = np.array(face_plane(A, task.order, center_of(A, task.center)))
         shows = task.body.in_goal

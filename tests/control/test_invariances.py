@@ -14,7 +14,7 @@ from projservo_cli.control.law import OK
 from projservo_cli.laws import CODES, LAW_SPECS
 from projservo_cli.loop.python import BuiltInLaw
 from projservo_cli.records import FloatArray, Model
-from projservo_cli.task.target import TaskImages
+from projservo_cli.task.target import Goal, TaskImages
 from tests.samples import frame, in_frame
 from tests.scene import FACE_LAWS, GAINS, scene
 
@@ -35,7 +35,7 @@ class Instant(NamedTuple):
     def seen(self, change) -> "Instant":
         """The same with all images changed alike."""
         s_start, s_star, s = (change(images) for images in (self.task.s_start, self.task.s_star, self.s))
-        return self._replace(task=self.task._replace(s_start=s_start, s_star=s_star), s=s)
+        return self._replace(task=self.task._replace(s_start=s_start).to(s_star), s=s)
 
 
 def instant(types, markers, rng) -> Instant:
@@ -43,7 +43,9 @@ def instant(types, markers, rng) -> Instant:
     step = rng.uniform(-0.3, 0.3, len(types))
     sc = scene(step, types, markers)
     q = sc.q_start + rng.uniform(0.0, 0.8) * step
-    return Instant(sc.model, TaskImages(sc.q_start, sc.s_start, sc.s_star, sc.plant.center), sc.images(q), q)
+    return Instant(
+        sc.model, TaskImages(sc.q_start, sc.s_start, Goal.at(sc.s_star), sc.plant.center), sc.images(q), q
+    )
 
 
 def other_frame(at, rng):

@@ -72,7 +72,7 @@ def in_truth(config, calibration, trace):
     scenario, truth = run_scenario(servo_inputs(config), calibration), truth_of(config)
     T, T_taught = (truth.displacement(q) for q in (trace.q[-1], scenario.q_taught))
     M, found = truth.of(scenario.world.numbers), []
-    for one in scenario.exact.incidences:
+    for one in scenario.exact.goal.incidences:
         tool, scene = (
             (np.array([M[list(at)].mean(axis=0) for at in flat]) @ where.T)[:, :3]
             for flat, where in ((one.tool, T), (one.scene, T_taught))

@@ -9,7 +9,7 @@ from projservo_cli.geometry.algebra import as_array, mat
 from projservo_cli.records import WorkFailed
 from projservo_cli.task.body import SETTLED, fit_body, make_body
 from projservo_cli.task.face import UNSEEN_GOAL, require_found
-from projservo_cli.task.target import TaskImages
+from projservo_cli.task.target import Goal, TaskImages
 from tests.samples import frame, pixels, poe
 from tests.scene import scene, with_pins
 
@@ -20,8 +20,12 @@ def case(G=None):
     M = np.concatenate([sc.plant.M, sc.plant.pins])
     model = sc.seen(G)
     body = make_body(model, M if G is None else M @ G.T)
-    s = (pixels(sc.model.P, M @ poe(sc.model, q).T) for q in (sc.q_start, sc.q_goal))
-    return model, TaskImages(sc.q_start, *s, -1, 5, body), body.M[:4] @ poe(model, sc.q_goal).T
+    s = [pixels(sc.model.P, M @ poe(sc.model, q).T) for q in (sc.q_start, sc.q_goal)]
+    return (
+        model,
+        TaskImages(sc.q_start, s[0], Goal.at(s[1]), -1, 5, body),
+        body.M[:4] @ poe(model, sc.q_goal).T,
+    )
 
 
 @pytest.mark.parametrize("seed", [None, 1])
@@ -48,7 +52,7 @@ def test_the_goal_is_the_least_squares_fit_to_all_that_is_seen(rng):
     fit = fit_body(model.P, shown.body, star, H, SETTLED, np.zeros((6, 7)))
     assert fit.settled
     wanted = shown.body.M[:4] @ as_array(fit.H).T
-    assert shown._replace(s_star=star).task(model).A_star == pytest.approx(wanted, abs=1e-8)
+    assert shown.to(star).task(model).A_star == pytest.approx(wanted, abs=1e-8)
 
 
 def test_images_of_no_body_are_refused():

@@ -218,7 +218,7 @@ class CalibratedWorld:
     def plant(self, images: TaskImages, *, opaque: bool) -> Plant:
         """Return the robot, undisturbed, as a law sees it from the start of a task; pins are its own."""
         shown = images.by_points() if len(images.pair) else images
-        task = shown._replace(incidences=()).task(self.model)  # the face of the goal, whatever is judged
+        task = shown.asking(()).task(self.model)  # the face of the goal, whatever is judged
         face = self.calibration.indices_of(self.numbers[: self.m])
         return Plant(
             model=self.model,

@@ -87,7 +87,7 @@ class SimulatedWorld(CalibratedWorld):
         if q_goal is None:
             return Ends(truth.robot.base_tool, np.full((4, 4), np.nan), np.full(4, np.nan))
         found = truth.ends(q_goal)
-        if not self.inputs.partly_carried:
+        if not images.goal.partly_carried:
             T = self._carried
             found = found._replace(goal_pose=T @ found.goal_pose, goal=T @ found.goal)
         return self._displaced(images, found)
@@ -112,7 +112,7 @@ class SimulatedWorld(CalibratedWorld):
 
     def nearest_ends(self, images: TaskImages, ends: Ends, plant: Plant, H: FloatArray) -> Ends:
         """Return true ends, of goals of incidences with the one nearest to the displacement H (4, 4)."""
-        if not images.incidences or not np.isfinite(ends.goal_pose).all():
+        if not images.goal.incidences or not np.isfinite(ends.goal_pose).all():
             return ends
         truth, on_tool = self.truth, plant.model.on_tool
         H_taught = ends.goal_pose @ np.linalg.inv(ends.base_tool)
@@ -120,9 +120,9 @@ class SimulatedWorld(CalibratedWorld):
             np.linalg.inv(H_taught) if on_tool else H_taught,
             make_body(truth.model, truth.of(self.numbers)),
         )
-        if self.inputs.partly_carried:
-            at = np.array([self._carried @ at if one.carried else at for one in images.incidences])
-        rows = incidences_of(truth.model, body, at, images.incidences)
+        if images.goal.partly_carried:
+            at = np.array([self._carried @ at if one.carried else at for one in images.goal.incidences])
+        rows = incidences_of(truth.model, body, at, images.goal.incidences)
         H = nearest_goal(rows, body, H, _point_velocities)
         pose = (np.linalg.inv(H) if on_tool else H) @ ends.base_tool
         return Ends(ends.base_tool, pose, H @ np.array(center_of(plant.M, plant.center)))
@@ -140,7 +140,7 @@ class SimulatedWorld(CalibratedWorld):
         if which:
             noise = draw(generator(seed, PIN_TARGET_NOISE), (drawn, V, len(others), 2))
             s[:drawn, :, m:] += sigma * noise[:, :, which]
-        return images._replace(s_start=s[0], s_star=s[1])
+        return images._replace(s_start=s[0]).to(s[1])
 
     def _look_now(self, carrier: CarryingObject, session: Session | None, q_start: FloatArray) -> Look:
         assert carrier.placed is not None
@@ -260,7 +260,7 @@ class RenderedWorld(SimulatedWorld):
         sigma = np.fmax(sigma, there)
         start = self._with_face("task.start", start, images.q_start, images.q_start)
         goal = self._with_face("task.goal", goal, None, images.q_start)
-        found = images._replace(s_start=start, s_star=goal)
+        found = images._replace(s_start=start).to(goal)
         if not len(found.body.M):
             return found
         weight = weights(sigma, sigma[..., None])
