@@ -87,6 +87,9 @@ class Incidences(NamedTuple):
     # (5 + V,) plane a of the face at the reference, number of markers of the body at the goal, once a view,
     # and a·O of each view there, in the frame of the body
     sight: FloatArray
+    # (d, r + 1) combinations of the errors, px, that change with the others alone near the goal, and are zero
+    # where all rows are met, as far as they can be; last what is left of each at the goal
+    rest: FloatArray
 
     @property
     def weight(self) -> FloatArray:
@@ -97,7 +100,7 @@ class Incidences(NamedTuple):
         """Select the rows and senses of some incidences, each row by itself."""
         rows = self.rows[np.isin(self.rows[:, _GROUP], numbers)]
         senses = self.senses[np.isin(self.senses[:, _OF], numbers)]
-        return _unweighted(self._replace(rows=rows, senses=senses))
+        return _unweighted(self._replace(rows=rows, senses=senses, rest=NO_INCIDENCES.rest))
 
     def weighing(self, weight: FloatArray) -> "Incidences":
         """Return the rows with other weights (w, r)."""
@@ -109,7 +112,9 @@ _SCENE, _SENSE, _OFFSET, _GROUP, _WEIGHT = 4, 8, 9, 10, 11
 # Columns of the senses after those of the tool and the scene, and entries of the sight after the plane.
 _IS_PLANE, _OF, _TURN_PX = 8, 9, 10
 _VIEWS_USED, SHOWN = 4, 5
-NO_INCIDENCES = Incidences(rows=np.zeros((0, _WEIGHT)), senses=np.zeros((0, 11)), sight=np.zeros(5))
+NO_INCIDENCES = Incidences(
+    rows=np.zeros((0, _WEIGHT)), senses=np.zeros((0, 11)), sight=np.zeros(5), rest=np.zeros((0, 1))
+)
 
 
 @inline
@@ -157,9 +162,15 @@ def turn_rate(sense: FloatArray, H: Mat4, H_back: Mat4, H_hat: Mat4) -> float:
 def image_error(incidences: Incidences, H: Mat4, H_back: Mat4) -> float:
     """Least motion of the images of the body that meets all incidences, px rms per marker and view.
 
-    To first order; of a feature that points the other way, as much more as half a turn moves them.
+    To first order; of a feature that points the other way, as much more as half a turn moves them. Far away,
+    independent errors may vanish where others that depend on them at the goal do not: these count as well.
     """
     rows, total = incidences.rows, 0.0
+    for left in incidences.rest:
+        error = -left[rows.shape[0]]
+        for i in range(rows.shape[0]):
+            error += left[i] * _error_of(rows[i], H, H_back)
+        total += error * error
     for k in range(rank_of(incidences)):
         error = 0.0
         for i in range(rows.shape[0]):
@@ -383,17 +394,20 @@ def weighted(
     senses[:, _TURN_PX] = [_turn_px(sense, H, motions[3:], J[:, 3:]) for sense in senses]
     shown = O @ np.linalg.inv(H).T @ a
     sight = np.array([*a, shows.sum(), *shown], dtype=np.float64)
-    return Incidences(rows, senses, sight).weighing(_independent(half / sigma[:, None]))
+    weight, rest = _independent(half / sigma[:, None])
+    found = Incidences(rows, senses, sight, NO_INCIDENCES.rest).weighing(weight)
+    e = linearized(_unweighted(found), H, motions)[0]
+    return found._replace(rest=np.ascontiguousarray(np.column_stack([rest, rest @ e])))
 
 
-def _independent(half: FloatArray) -> FloatArray:
-    """Weights (w, r) that make independent errors of unit variance of those of rows.
+def _independent(half: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Weights (w, r) that make independent errors of unit variance of those of rows, and the rest (r − w, r).
 
     half : (r, p) errors by independent ones, each of unit variance.
     """
-    U, s, _ = np.linalg.svd(half, full_matrices=False)
-    kept = s**2 > _DEPENDENT * s[0] ** 2
-    return np.asarray((U[:, kept] / s[kept]).T)
+    U, s, _ = np.linalg.svd(half)
+    kept = int(np.sum(s**2 > _DEPENDENT * s[0] ** 2))
+    return np.asarray((U[:, :kept] / s[:kept]).T), np.asarray(U[:, kept:].T)
 
 
 def _turn_px(sense: FloatArray, H: FloatArray, turns: FloatArray, J: FloatArray) -> float:
@@ -518,7 +532,7 @@ def errors_px(incidences: Incidences, H: FloatArray) -> FloatArray:
     """
     half, group, own = np.linalg.pinv(incidences.weight), incidences.rows[:, _GROUP], list[Incidences]()
     for k in np.unique(group):
-        independent = _independent(half[group == k])
+        independent, _ = _independent(half[group == k])
         weight = np.zeros((len(independent), len(group)))
         weight[:, group == k] = independent / math.sqrt(len(independent))
         own.append(incidences.weighing(weight)._replace(senses=incidences.of([int(k)]).senses))

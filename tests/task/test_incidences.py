@@ -395,3 +395,24 @@ def test_the_law_leaves_where_a_feature_points_the_other_way(flat):
         begun, end = (poe(model, q) for q in (model.q_reference, case.drive(model.q_reference, gain=0.5)))
         assert image_error_at(case.rows, begun) > 10.0
         assert image_error_at(case.rows, end) < 0.01  # px; the free motion goes on, and disturbs that much
+
+
+@pytest.mark.volume
+def test_independent_errors_that_vanish_far_from_the_goal_are_no_arrival():
+    """Of three points on points six errors are independent, and vanish in other places than the goal too."""
+    elsewhere = 0
+    for seed in range(7, 13):
+        generator = np.random.default_rng([31, seed])
+        model, M = random_arm(generator)
+        case = Case(model, M, whole_pose(M[:4]), model.q_reference)
+        assert case.rows.rest.shape == (3, 10)
+        for _ in range(5):
+            H = poe(model, case.drive(model.q_reference + deviating(generator, size=1.2), gain=0.5))
+            independent = np.linalg.norm(linearized(case.rows, H, np.zeros((0, 4, 4)))[0])
+            left, error = errors_px(case.rows, H[None]).max(), image_error_at(case.rows, H)
+            if independent < 1e-3 and left > 1.0:
+                elsewhere += 1
+                assert error > 1.0
+            elif independent < 1e-9:
+                assert error < 1e-6
+    assert elsewhere > 3

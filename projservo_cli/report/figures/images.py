@@ -401,6 +401,7 @@ def _draw_frames(data: Data, figure: "style.Figure") -> None:
 _LEAST_PX = 1e-3  # lowest error that is drawn
 _ARROW = 0.06  # of free motions, over the size of what is drawn
 _FREE = style.line(style.PURPLE, width=1.4)
+_TITLES = 84  # characters of all titles in a row
 _ERRORS_HEIGHT = 3.2  # inches, of the panels of errors with titles and legend
 _LEAST_ASPECT = 0.55  # height over width of an image of features
 
@@ -484,7 +485,7 @@ def _draw_incidences(data: Data, figure: "style.Figure") -> None:
             error = np.maximum(data[f"px_{name}"][:, k], _LEAST_PX)
             panel.plot(data[f"t_s_{name}"], error, **style.curve(i, title(name)))
         style.log_scale(panel)
-        heading = f"{incidence}{_within(data, k)}"
+        heading = textwrap.fill(str(incidence), _TITLES // count) + _within(data, k)
         panel.set(title=heading, xlabel="time (s)", ylim=(0.5 * lowest, 2.0 * highest))
     panels[0].set_ylabel("error (px at one px of noise)")
     style.legend_below(figure, 4)
