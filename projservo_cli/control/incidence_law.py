@@ -37,8 +37,10 @@ def incidences(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatAr
     H_back = inverse(H)
     rank, n, work = rank_of(task.incidences), q.shape[0], state.work
     J, velocity, system, step = work.J[:rank], work.xi[:rank], work.system, work.newton
-    if _turned_over(task, gains, H, H_back, state):
-        return OK
+    for sense in task.incidences.senses:
+        if points_away(sense, H, H_back):
+            _turn_over(task, gains, H, H_back, state)
+            return OK
     linearize_into(task.incidences, H, H_back, work.H_hat, velocity, J)
     _lead_free(task, gains, q, H_back, state)
     for k in range(rank):
@@ -61,25 +63,21 @@ def incidences(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatAr
 
 
 @internal
-def _turned_over(task: Task, gains: Gains, H: Mat4, H_back: Mat4, state: State) -> bool:
+def _turn_over(task: Task, gains: Gains, H: Mat4, H_back: Mat4, state: State) -> None:
     """Write the velocity that turns features that point the other way, as far as the joints can turn them.
 
     The steepest way to their sense, of a rad in a time constant, with the middle of the body at its place as
-    far as that leaves joints. Returns whether there are such features.
+    far as that leaves joints.
     """
     z, n, work, body = state.q_dot, state.q_dot.shape[0], state.work, task.body
     J, shift, step = work.J[:_SHIFTS], work.xi[:_SHIFTS], work.newton
-    away = False
     for sense in task.incidences.senses:
         if points_away(sense, H, H_back):
-            away = True
             for i in range(n):
                 step[i] = turn_rate(sense, H, H_back, mat(work.H_hat[i]))
             size = _norm(step)
             for i in range(n):
                 z[i] += step[i] / size if size > 0.0 else 1.0
-    if not away:
-        return False
     middle = apply(H, center_of(body.M, MIDPOINT))
     for k in range(_SHIFTS):
         shift[k] = 0.0
@@ -92,7 +90,6 @@ def _turned_over(task: Task, gains: Gains, H: Mat4, H_back: Mat4, state: State) 
     size = _norm(z)
     for i in range(n):
         z[i] *= gains.gain / size if size > 0.0 else 0.0
-    return True
 
 
 @inline

@@ -76,52 +76,49 @@ class Incidences(NamedTuple):
     Few arrays, since every step of every law hands them on.
     """
 
-    # (r, 11 + w) point of the tool at the reference, plane of the scene, and a sense of 1; or plane of the
-    # tool, point of the scene, and a sense of −1; then the offset of e = bᵀA − offset, the number of the
-    # incidence, and the weight of e in each of w independent errors
+    # (r, 11 + w + d) point of the tool at the reference, plane of the scene, and a sense of 1; or plane of
+    # the tool, point of the scene, and a sense of −1; then the offset of e = bᵀA − offset, the number of the
+    # incidence, the weight of e in each of w independent errors, and in each of d others, which change with
+    # these alone near the goal
     rows: FloatArray
     # (g, 11) direction or plane of the tool at the reference, the direction of the scene, or across its
     # plane, to which that of the tool is to point, 1 for planes, the number of the incidence, and the error
     # of half a turn, px
     senses: FloatArray
-    # (5 + V,) plane a of the face at the reference, number of markers of the body at the goal, once a view,
-    # and a·O of each view there, in the frame of the body
+    # (6 + V + d,) plane a of the face at the reference, number of markers of the body at the goal, once a
+    # view, w, a·O of each view there, in the frame of the body, and what is left of each other error, px
     sight: FloatArray
-    # (d, r + 1) combinations of the errors, px, that change with the others alone near the goal, and are zero
-    # where all rows are met, as far as they can be; last what is left of each at the goal
-    rest: FloatArray
 
     @property
     def weight(self) -> FloatArray:
         """Weights (w, r) of the rows in independent errors."""
-        return self.rows[:, _WEIGHT:].T
+        return self.rows[:, _WEIGHT : _WEIGHT + rank_of(self)].T
 
     def of(self, numbers: Sequence[int]) -> "Incidences":
         """Select the rows and senses of some incidences, each row by itself."""
         rows = self.rows[np.isin(self.rows[:, _GROUP], numbers)]
         senses = self.senses[np.isin(self.senses[:, _OF], numbers)]
-        return _unweighted(self._replace(rows=rows, senses=senses, rest=NO_INCIDENCES.rest))
+        return _unweighted(self._replace(rows=rows, senses=senses))
 
     def weighing(self, weight: FloatArray) -> "Incidences":
-        """Return the rows with other weights (w, r)."""
-        return self._replace(rows=np.column_stack([self.rows[:, :_WEIGHT], weight.T]))
+        """Return the rows with other weights (w, r), and without other errors."""
+        sight = self.sight.copy()
+        sight[_RANK] = len(weight)
+        return self._replace(rows=np.column_stack([self.rows[:, :_WEIGHT], weight.T]), sight=sight)
 
 
 # Columns of the rows: of the tool, then of the scene, and these.
 _SCENE, _SENSE, _OFFSET, _GROUP, _WEIGHT = 4, 8, 9, 10, 11
 # Columns of the senses after those of the tool and the scene, and entries of the sight after the plane.
 _IS_PLANE, _OF, _TURN_PX = 8, 9, 10
-_VIEWS_USED, SHOWN = 4, 5
-NO_INCIDENCES = Incidences(
-    rows=np.zeros((0, _WEIGHT)), senses=np.zeros((0, 11)), sight=np.zeros(5), rest=np.zeros((0, 1))
-)
+_VIEWS_USED, _RANK, SHOWN = 4, 5, 6
+NO_INCIDENCES = Incidences(rows=np.zeros((0, _WEIGHT)), senses=np.zeros((0, 11)), sight=np.zeros(SHOWN))
 
 
 @inline
 def rank_of(incidences: Incidences) -> int:
     """Return the number of independent errors."""
-    columns: int = incidences.rows.shape[1]
-    return columns - _WEIGHT
+    return int(incidences.sight[_RANK])
 
 
 @merged
@@ -165,21 +162,17 @@ def image_error(incidences: Incidences, H: Mat4, H_back: Mat4) -> float:
     To first order; of a feature that points the other way, as much more as half a turn moves them. Far away,
     independent errors may vanish where others that depend on them at the goal do not: these count as well.
     """
-    rows, total = incidences.rows, 0.0
-    for left in incidences.rest:
-        error = -left[rows.shape[0]]
-        for i in range(rows.shape[0]):
-            error += left[i] * _error_of(rows[i], H, H_back)
-        total += error * error
-    for k in range(rank_of(incidences)):
-        error = 0.0
+    rows, sight, total = incidences.rows, incidences.sight, 0.0
+    rank, count = rank_of(incidences), rows.shape[1] - _WEIGHT
+    for k in range(count):
+        error = 0.0 if k < rank else -sight[sight.shape[0] - count + k]
         for i in range(rows.shape[0]):
             error += rows[i, _WEIGHT + k] * _error_of(rows[i], H, H_back)
         total += error * error
     for sense in incidences.senses:
         if points_away(sense, H, H_back):
             total += sense[_TURN_PX] * sense[_TURN_PX]
-    return math.sqrt(total / incidences.sight[_VIEWS_USED])
+    return math.sqrt(total / sight[_VIEWS_USED])
 
 
 @njit
@@ -393,11 +386,14 @@ def weighted(
     rows[:, _OFFSET] /= sigma
     senses[:, _TURN_PX] = [_turn_px(sense, H, motions[3:], J[:, 3:]) for sense in senses]
     shown = O @ np.linalg.inv(H).T @ a
-    sight = np.array([*a, shows.sum(), *shown], dtype=np.float64)
+    sight = np.array([*a, shows.sum(), 0.0, *shown], dtype=np.float64)
     weight, rest = _independent(half / sigma[:, None])
-    found = Incidences(rows, senses, sight, NO_INCIDENCES.rest).weighing(weight)
-    e = linearized(_unweighted(found), H, motions)[0]
-    return found._replace(rest=np.ascontiguousarray(np.column_stack([rest, rest @ e])))
+    found = Incidences(rows, senses, sight).weighing(weight)
+    left = rest @ linearized(_unweighted(found), H, motions)[0]
+    return found._replace(
+        rows=np.ascontiguousarray(np.column_stack([found.rows, rest.T])),
+        sight=np.concatenate([found.sight, left]),
+    )
 
 
 def _independent(half: FloatArray) -> tuple[FloatArray, FloatArray]:

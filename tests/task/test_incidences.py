@@ -405,7 +405,7 @@ def test_independent_errors_that_vanish_far_from_the_goal_are_no_arrival():
         generator = np.random.default_rng([31, seed])
         model, M = random_arm(generator)
         case = Case(model, M, whole_pose(M[:4]), model.q_reference)
-        assert case.rows.rest.shape == (3, 10)
+        assert case.rows.rows.shape == (9, 11 + 6 + 3)
         for _ in range(5):
             H = poe(model, case.drive(model.q_reference + deviating(generator, size=1.2), gain=0.5))
             independent = np.linalg.norm(linearized(case.rows, H, np.zeros((0, 4, 4)))[0])
