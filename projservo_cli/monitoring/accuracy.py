@@ -45,10 +45,17 @@ def metric_points(model: Model, M: FloatArray) -> FloatArray | None:
 
 def metres_a_unit(model: Model, M: FloatArray, lengths: FloatArray) -> float:
     """Metres a unit of the metric of the arm, by lengths (m, m) between markers (m, 4); NaN if unknown."""
-    X, (i, k) = metric_points(model, M), np.nonzero(lengths > 0.0)
-    if X is None or not len(i):
-        return math.nan
-    return float(np.median(lengths[i, k] / np.linalg.norm(X[i] - X[k], axis=1)))
+    X = metric_points(model, M)
+    return math.nan if X is None else float(metres_by(X, lengths))
+
+
+def metres_by(X: FloatArray, lengths: FloatArray) -> FloatArray:
+    """Metres a unit (...) of points (..., k, 3), by lengths (m, m) between the first m; NaN if unknown."""
+    i, k = np.nonzero(lengths > 0.0)
+    if not len(i):
+        return np.full(X.shape[:-2], math.nan)
+    apart = np.linalg.norm(X[..., i, :] - X[..., k, :], axis=-1)
+    return np.asarray(np.median(lengths[i, k] / apart, axis=-1))
 
 
 class Posture:

@@ -38,8 +38,8 @@ def connected_robot(
     """
     contract, world, plant = scenario.servo.contract, scenario.world, scenario.plant_of(law)
     assert contract is not None
-    calibration, whole = world.calibration, scenario.plant_of("exact")
-    steered = world.opened(session, contract, scenario.exact.q_start, whole, given)
+    calibration = world.calibration
+    steered = world.opened(session, contract, scenario.exact.q_start, plant, given)
     monitor = None
     if not scenario.untested:
         noise = scenario.servo.stop.innovation_threshold * scenario.world.noise_px

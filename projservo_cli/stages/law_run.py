@@ -45,9 +45,7 @@ from projservo_cli.stages.motions import PathReplanner, search_of, why_closed
 from projservo_cli.stages.plugin_law import LawSetup, PluginLaw
 from projservo_cli.stages.scenario import RunScenario
 from projservo_cli.task.face import Task, center_of
-from projservo_cli.task.incidences import (
-    whole_pose,
-)
+from projservo_cli.task.incidences import whole_pose
 from projservo_cli.task.target import TaskImages, followed
 from projservo_cli.words.table import Setup
 

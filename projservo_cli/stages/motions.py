@@ -101,7 +101,7 @@ def search_of(scenario: Scenario) -> JointSearch:
         world.inputs.trajectory.search.seed,
         scenario.world.least_views,
     )
-    closed = None if world.knows_limits(world.joints.limits) else Finding("unknown_limits", REFUSES)
+    closed = None if world.knows_limits else Finding("unknown_limits", REFUSES)
     return JointSearch(scenario.joints_at_goal, scenario.goal_sigma_px, spread, closed)
 
 

@@ -7,7 +7,7 @@ A ``Scenario`` is made once from the inputs of a stage and a calibration; a plan
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Self
 
 import numpy as np
@@ -38,7 +38,7 @@ from projservo_cli.simulation.workspace import Truth
 from projservo_cli.stages.stage_inputs import PlanInputs, ServoInputs
 from projservo_cli.stages.worlds.calibrated import CalibratedWorld, measures_points, observed_numbers
 from projservo_cli.stages.worlds.simulated import RenderedWorld, SimulatedWorld
-from projservo_cli.stages.worlds.task_images import in_body, positioned, unseen
+from projservo_cli.stages.worlds.task_images import given_pixels, in_body, positioned
 from projservo_cli.task.incidences import Incidence
 from projservo_cli.task.stand_off import displacement_back
 from projservo_cli.task.target import TaskImages, is_stereo
@@ -172,15 +172,8 @@ class Scenario:
         world, given = self.world, self.world.goal_images
         if given is None or not world.calibration.has_covariance:
             return None
-        numbers, face, view = world.calibration.marker.tolist(), world.inputs.face, world.view
-        pixels, none = given.pixels(face, view), unseen(len(view))
-        images = np.array([pixels.get(number, none) for number in numbers]).swapaxes(0, 1)
-        known = [number in pixels for number in numbers]
-        sigma = np.full((len(view), len(numbers)), world.noise_px)
-        told = [number for number in numbers if number in pixels]
-        stated = np.array(given.deviations(told, face, view))
-        sigma[:, known] = np.where(np.isnan(stated), world.noise_px, stated)
-        return images, sigma
+        s, sigma = given_pixels(given, world.calibration.marker.tolist(), world.inputs.face, world.view)
+        return s, np.where(np.isnan(sigma), world.noise_px, sigma)
 
     def images_at(self, seed: int) -> TaskImages:
         """Start and goal as the images of a seed show them; a goal may be carried along, then displaced."""
@@ -224,7 +217,8 @@ class RunScenario(Scenario):
 
     def plant_of(self, law: str) -> Plant:
         """The robot as a law sees it."""
-        return self.world.plant(self.images_for(law), opaque=self.servo.opaque)
+        images, pins = partial(self.images_for, law), self.measures_body(law)
+        return self.world.plant(self.exact.q_start, images, pins=pins, opaque=self.servo.opaque)
 
 
 def world_of(inputs: PlanInputs, calibration: Calibration) -> CalibratedWorld:

@@ -13,6 +13,7 @@ from scipy.linalg import expm
 
 from projservo_cli.geometry.displacements import generators
 from projservo_cli.metric.frame import changes_of
+from projservo_cli.monitoring.accuracy import metres_by
 from projservo_cli.records import MEET, MM, PARALLEL, PERPENDICULAR, Calibration, FloatArray, WorkFailed
 from projservo_cli.task.incidences import Incidence
 from projservo_cli.task.look_bundle import BundleFit, Look, LookRig
@@ -29,12 +30,10 @@ class Separation(NamedTuple):
     Each vanishes with the error, and changes smoothly with the features.
     """
 
-    apart: (
-        FloatArray  # (..., p, 3) between each point of the smaller feature and the other one; p is 0 if free
-    )
-    turned: (
-        FloatArray  # (..., 1 or 3) sine of the angle about each axis, or the angle, rad; 0 columns of points
-    )
+    # (..., p, 3) between each point of the smaller feature and the other one; p is 0 if they need not meet
+    apart: FloatArray
+    # (..., 1 or 3) sine of the angle about each axis, or the angle, rad; 0 columns for points
+    turned: FloatArray
 
     @classmethod
     def of(cls, one: Incidence, tool: FloatArray, scene: FloatArray) -> "Separation":
@@ -160,15 +159,6 @@ def placed_by(rig: LookRig, markers: Sequence[int], ends: TaughtAndNow, unit_mm:
     return Placed(M, np.concatenate([fit.T for fit in fits]), E, unit_mm, (errors[0], errors[1]))
 
 
-def mm_a_unit(M: FloatArray, lengths: FloatArray) -> FloatArray:
-    """Millimetres (B,) a unit of markers (B, k, 4), by lengths (m, m), m, between the first, if known."""
-    i, k = np.nonzero(lengths > 0.0)
-    if not len(i):
-        return np.full(len(M), np.nan)
-    apart = np.linalg.norm(M[:, i, :3] - M[:, k, :3], axis=-1)
-    return np.asarray(MM * np.median(lengths[i, k] / apart, axis=1))
-
-
 def incidence_errors(
     c: Calibration,
     markers: Sequence[int],
@@ -185,7 +175,7 @@ def incidence_errors(
     found, rig = np.full((len(asked), 4), np.nan), metric_rig(c)
     if rig is None or not np.isfinite([ends.H_taught, ends.H]).all():
         return IncidenceErrors(*found.T)
-    unit = mm_a_unit(rig.M[:, list(markers)], lengths)
+    unit = MM * metres_by(rig.M[:, list(markers), :3], lengths)
     known = np.isfinite(unit[0])
     placed = placed_by(rig, markers, ends, unit if known else np.ones(len(unit)))
     for row, one in zip(found, asked, strict=True):
@@ -195,10 +185,8 @@ def incidence_errors(
         if apart.size and known:
             off = unit[0] * np.linalg.norm(apart, axis=1)
             k = int(np.argmax(off))
-            row[0], row[2] = (
-                off[k],
-                np.hypot(np.sqrt(variance[: apart.size].reshape(-1, 3)[k].sum()), ends.taught_mm),
-            )
+            at_point = variance[: apart.size].reshape(-1, 3)[k].sum()
+            row[0], row[2] = off[k], np.hypot(np.sqrt(at_point), ends.taught_mm)
         if turned.size:
             row[1] = np.degrees(angle_off(one, tool, scene))
             row[3] = np.hypot(np.degrees(np.sqrt(variance[apart.size :].sum())), ends.taught_deg)

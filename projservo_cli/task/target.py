@@ -138,12 +138,17 @@ class TaskImages(NamedTuple):
         """Displacement (4, 4) of the body at the pose to drive to; raises as ``task``."""
         return self._measured(model)[1]
 
-    def displacements_taught(self, model: Model) -> FloatArray:
-        """Displacements (g, 4, 4) of the body where each incidence was taught; raises as ``task``."""
-        goal = self.goal
-        asked = {one.carried: goal.carried if one.carried else goal.taught for one in goal.incidences}
-        H = {carried: self.to(s).displacement_at_goal(model) for carried, s in asked.items()}
-        return np.array([H[one.carried] for one in goal.incidences])
+    def displacements_taught(self, model: Model, H_star: FloatArray | None = None) -> FloatArray:
+        """Displacements (g, 4, 4) of the body where each incidence was taught; raises as ``task``.
+
+        H_star : (4, 4) displacement at the pose to drive to, if it is known.
+        """
+        goal, found = self.goal, dict[bool, FloatArray]()
+        for carried in {one.carried for one in goal.incidences}:
+            s = goal.carried if carried else goal.taught
+            known = H_star if s is goal.s else None
+            found[carried] = self.to(s).displacement_at_goal(model) if known is None else known
+        return np.array([found[one.carried] for one in goal.incidences])
 
     def displacement_at_start(self, model: Model) -> FloatArray:
         """Displacement (4, 4) of the body at the start; raises WorkFailed where images do not show it."""
@@ -176,7 +181,7 @@ class TaskImages(NamedTuple):
 
     def _rows(self, model: Model, task: Task, H_star: FloatArray) -> Incidences:
         """Rows of the incidences by a task to the goal (4, 4)."""
-        rows = incidences_of(model, task.body, self.displacements_taught(model), self.goal.incidences)
+        rows = incidences_of(model, task.body, self.displacements_taught(model, H_star), self.goal.incidences)
         A = np.ascontiguousarray(task.body.M[: len(task.A_star)])
         face = np.array(face_plane(A, task.order, center_of(A, task.center)))
         shows = task.body.in_goal

@@ -14,6 +14,13 @@ from tests.known import configured
 from tests.studies.carried_goals import carried_pose
 
 PART = configured("object").objects.named["part"]
+# Six markers about a point, that have moved since the goal was taught.
+AROUND = np.array([0.55, 0.1, 0.45]) + 0.04 * np.random.default_rng(1).standard_normal((6, 3))
+BLOCK = {
+    "markers": [*range(40, 46)],
+    "positions_m": AROUND.tolist(),
+    "displacement": {"translation_m": [-0.02, 0.03, 0.01], "rotation_deg": [4.0, -5.0, 8.0]},
+}
 
 
 @cache
@@ -65,15 +72,9 @@ def test_a_goal_is_carried_along_to_where_it_should_be_as_well_as_is_stated():
 
 def test_incidences_on_an_object_are_met_where_it_is_now():
     """The pin in the hole of a part that has moved, whose taught pose nothing shows any more."""
-    middle = np.array([0.55, 0.1, 0.45])
-    block = {
-        "markers": [*range(40, 46)],
-        "positions_m": (middle + 0.04 * np.random.default_rng(1).standard_normal((6, 3))).tolist(),
-        "displacement": {"translation_m": [-0.02, 0.03, 0.01], "rotation_deg": [4.0, -5.0, 8.0]},
-    }
     config = configured(
         "insertion",
-        f"objects.block={json.dumps(block)}",
+        f"objects.block={json.dumps(BLOCK)}",
         *("features.hole.on=block", "features.bottom.on=block"),
     )
     calibration = calibrate.run(config)[1]
@@ -92,16 +93,10 @@ def test_incidences_on_an_object_are_met_where_it_is_now():
 
 def test_a_part_and_the_scene_are_in_one_goal():
     """The pin in a hole of a part that has moved, its tip on a plane of the scene that has not."""
-    middle = np.array([0.55, 0.1, 0.45])
-    block = {
-        "markers": [*range(40, 46)],
-        "positions_m": (middle + 0.04 * np.random.default_rng(1).standard_normal((6, 3))).tolist(),
-        "displacement": {"translation_m": [-0.02, 0.03, 0.01], "rotation_deg": [4.0, -5.0, 8.0]},
-    }
     table = {"side": {"on": "tool", "plane": [0, 1, 10]}, "table": {"on": "scene", "plane": "side"}}
     config = configured(
         "insertion",
-        f"objects.block={json.dumps(block)}",
+        f"objects.block={json.dumps(BLOCK)}",
         "features.hole.on=block",
         *(f"features.{name}={json.dumps(one)}" for name, one in table.items()),
         "task.goal.incidences=[[pin, hole], [tip, table]]",

@@ -5,6 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from projservo_cli.metric.frame import changes_of
+from projservo_cli.monitoring.accuracy import metres_by
 from projservo_cli.records import ANGLE, MEET, PARALLEL, PERPENDICULAR
 from projservo_cli.task.incidence_errors import (
     Separation,
@@ -12,7 +13,6 @@ from projservo_cli.task.incidence_errors import (
     angle_off,
     incidence_errors,
     metric_rig,
-    mm_a_unit,
     placed_by,
 )
 from projservo_cli.task.incidences import Incidence
@@ -112,7 +112,7 @@ def test_changes_are_those_of_poses_fitted_again_with_a_calibration_that_is_off(
     rig = metric_rig(calibration)
     shown = [rig.pixels(rig.M[0, markers] @ (rig.G @ H @ np.linalg.inv(rig.G)).T)[0] for H in ends[2:4]]
     ends = ends._replace(taught=ends.taught._replace(s=shown[0]), now=ends.now._replace(s=shown[1]))
-    unit = mm_a_unit(rig.M[:, markers], lengths)
+    unit = 1e3 * metres_by(rig.M[:, markers, :3], lengths)
     whole = placed_by(rig, markers, ends, unit)
     again = []
     for b in range(len(rig.M)):

@@ -2,6 +2,7 @@
 
 import math
 import time
+from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -20,7 +21,6 @@ from projservo_cli.records import (
     Calibration,
     FloatArray,
     InputError,
-    JointLimits,
     Model,
     WorkFailed,
 )
@@ -35,7 +35,7 @@ from projservo_cli.simulation.analytic_plant import Ends, Plant
 from projservo_cli.simulation.workspace import turned
 from projservo_cli.stages.external_robot import opened_robot, path_to
 from projservo_cli.stages.stage_inputs import CarryingObject, Contract, PlanInputs
-from projservo_cli.stages.worlds.task_images import look_taught, task_images
+from projservo_cli.stages.worlds.task_images import given_pixels, task_images
 from projservo_cli.task.body import NO_BODY, Body, make_body
 from projservo_cli.task.look_bundle import Look
 from projservo_cli.task.target import TaskImages, is_stereo
@@ -179,7 +179,7 @@ class CalibratedWorld:
         now = self._look_now(carrier, session, ends.q_start)
         if carrier.taught is None:
             return self._look_before(carrier, q_taught), now
-        return look_taught(carrier, carrier.taught, self.view), now
+        return Look(*given_pixels(carrier.taught, carrier.numbers, (), self.view)), now
 
     def _look_now(self, carrier: CarryingObject, session: Session | None, q_start: FloatArray) -> Look:
         """Images of an object by the robot where it stands, or by a simulated one at the start (n,)."""
@@ -211,13 +211,22 @@ class CalibratedWorld:
             )
         return arm.model(P, on_tool=self.inputs.mount == TOOL)
 
-    def knows_limits(self, limits: JointLimits) -> bool:
+    @property
+    def knows_limits(self) -> bool:
         """Whether a path through joint space can be searched within the limits of the joints."""
+        limits = self.joints.limits
         return bool(np.isfinite([limits.lower, limits.upper]).all())
 
-    def plant(self, images: TaskImages, *, opaque: bool) -> Plant:
-        """Return the robot, undisturbed, as a law sees it from the start of a task; pins are its own."""
-        shown = images.by_points() if len(images.pair) else images
+    def plant(
+        self, q_start: FloatArray, images: Callable[[], TaskImages], *, pins: bool, opaque: bool
+    ) -> Plant:
+        """Return the robot, undisturbed, as a law sees it from joints (n,).
+
+        images : start and goal as the law measures them, which tell the sides of a face that is believed.
+        pins : whether a simulated one shows the markers of the body that are not on the face.
+        """
+        shown = images()
+        shown = shown.by_points() if len(shown.pair) else shown
         task = shown.asking(()).task(self.model)  # the face of the goal, whatever is judged
         face = self.calibration.indices_of(self.numbers[: self.m])
         return Plant(

@@ -1,7 +1,7 @@
 """Simulated worlds: the truth, seen as points or by rendered cameras."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -17,7 +17,6 @@ from projservo_cli.planning.shown_joints import NEAR_PX, joints_showing
 from projservo_cli.records import (
     CORNERS,
     FloatArray,
-    JointLimits,
     Model,
     WorkFailed,
 )
@@ -116,10 +115,8 @@ class SimulatedWorld(CalibratedWorld):
             return ends
         truth, on_tool = self.truth, plant.model.on_tool
         H_taught = ends.goal_pose @ np.linalg.inv(ends.base_tool)
-        at, body = (
-            np.linalg.inv(H_taught) if on_tool else H_taught,
-            make_body(truth.model, truth.of(self.numbers)),
-        )
+        body = make_body(truth.model, truth.of(self.numbers))
+        at = np.linalg.inv(H_taught) if on_tool else H_taught
         if images.goal.partly_carried:
             at = np.array([self._carried @ at if one.carried else at for one in images.goal.incidences])
         rows = incidences_of(truth.model, body, at, images.goal.incidences)
@@ -161,14 +158,17 @@ class SimulatedWorld(CalibratedWorld):
         """Return the true model."""
         return self.truth.model
 
-    def knows_limits(self, limits: JointLimits) -> bool:
+    @property
+    def knows_limits(self) -> bool:
         """Whether a path through joint space can be searched: always."""
         return True
 
-    def plant(self, images: TaskImages, *, opaque: bool) -> Plant:
-        """Return the true robot, undisturbed, from the start of a task."""
-        found = plant_of(self.truth, images.q_start, opaque=opaque, least_views=self.least_views)
-        return found._replace(pins=self.truth.of(self.numbers[self.m :]) if images.pins else NO_PINS)
+    def plant(
+        self, q_start: FloatArray, images: Callable[[], TaskImages], *, pins: bool, opaque: bool
+    ) -> Plant:
+        """Return the true robot, undisturbed, from joints (n,)."""
+        found = plant_of(self.truth, q_start, opaque=opaque, least_views=self.least_views)
+        return found._replace(pins=self.truth.of(self.numbers[self.m :]) if pins else NO_PINS)
 
     def noise(self, numbers: Sequence[int], seed: int, times: int) -> FloatArray:
         """Pixel noise (instants, V, markers, 2) of a seed, px, for markers of which the face comes first.
@@ -190,7 +190,7 @@ class SimulatedWorld(CalibratedWorld):
     def opened(
         self, session: Session, contract: Contract, q_start: FloatArray, plant: Plant, given: Robot | None
     ) -> Steered:
-        """Open the simulated robot of a contract at joints (n,), which shows the whole plant."""
+        """Open the simulated robot of a contract at joints (n,)."""
         return session.steered or session.opened(self._robot(contract, q_start, plant))
 
     def _robot(self, contract: Contract, q_start: FloatArray, plant: Plant) -> PluginRobot:

@@ -11,9 +11,7 @@ from projservo_cli.records import (
     InputError,
 )
 from projservo_cli.settings.task import GoalImages, TaskSettings
-from projservo_cli.stages.stage_inputs import CarryingObject
 from projservo_cli.task.incidences import Flat
-from projservo_cli.task.look_bundle import Look
 from projservo_cli.task.stand_off import StandOff
 from projservo_cli.task.target import Goal, TaskImages
 
@@ -66,15 +64,20 @@ def unseen(views: int) -> tuple[tuple[float, float], ...]:
     return ((math.nan, math.nan),) * views
 
 
-def look_taught(carrier: CarryingObject, images: GoalImages, view: Sequence[str]) -> Look:
-    """Images of an object that were kept when the goal was taught."""
-    pixels = images.pixels((), view)
-    shown = np.array([pixels.get(number, unseen(len(view))) for number in carrier.numbers]).swapaxes(0, 1)
-    told = [number for number in carrier.numbers if number in pixels]
-    sigma = np.full(shown.shape[:2], np.nan)
-    known = [number in told for number in carrier.numbers]
-    sigma[:, known] = np.array(images.deviations(told, (), view)).reshape(len(shown), -1)
-    return Look(shown, sigma)
+def given_pixels(
+    images: GoalImages, numbers: Sequence[int], face: Sequence[int], view: Sequence[str]
+) -> tuple[FloatArray, FloatArray]:
+    """Images (V, k, 2) that are given of some markers, and their deviations (V, k), px; NaN where not given.
+
+    face : numbers of the markers that images without numbers are of.
+    """
+    pixels, none = images.pixels(face, view), unseen(len(view))
+    s = np.array([pixels.get(number, none) for number in numbers]).swapaxes(0, 1)
+    told = [number for number in numbers if number in pixels]
+    sigma = np.full(s.shape[:2], np.nan)
+    known = [number in told for number in numbers]
+    sigma[:, known] = np.array(images.deviations(told, face, view)).reshape(len(s), -1)
+    return s, sigma
 
 
 def positioned(asked: StandOff, numbers: Sequence[int]) -> StandOff:
