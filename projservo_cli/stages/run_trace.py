@@ -122,7 +122,7 @@ def trace_of(run: LawRun) -> Trace:
         center=poses.center,
         unplanned=run.unplanned,
         **_incidences(run),
-        **_stated_mm(run, views),
+        **_stated_mm(run),
         untested=text((*untested, *lost), run.setup),
         overruns=None if driven is None else driven.steered.overruns,
         force=None if driven is None or not driven.forces else _whole(driven.forces, rows),
@@ -143,19 +143,24 @@ def _whole(values: Sequence[FloatArray] | Sequence[float], rows: int) -> FloatAr
     return np.array([*values, *[missing] * (rows - len(values))])
 
 
-def _stated_mm(run: LawRun, views: FloatArray) -> dict[str, Any]:
+def _credible(run: LawRun) -> bool:
+    """Whether images agree with the calibration at the end of a run, so that errors can be stated by both."""
+    scenario, ended = run.scenario, VERDICTS[run.verdict]
+    refuted = ended.refutes and (run.why is None or run.why.code != "pressed")
+    untested = run.driven is not None and scenario.untested
+    noise = [_LEAST_NOISE_PX, scenario.world.noise_px, scenario.world.calibration.sigma_px]
+    _, after, views = run.log.fit[run.steps]
+    left = _rms(after[None], 2.0 * views[None] - COORDINATES)[0]
+    return not (refuted or ended.retried or untested or left > _AGREES * max(noise))
+
+
+def _stated_mm(run: LawRun) -> dict[str, Any]:
     """State how far the face ended from the goal, rms mm: by images, and by what no test tells from none.
 
     Nothing if no length on the face is known, or images disagree with the calibration.
     """
     scenario, calibration, m = run.scenario, run.scenario.world.calibration, run.scenario.world.m
-    if scenario.exact.goal.incidences:  # from one goal of many
-        return {}
-    noise = [_LEAST_NOISE_PX, scenario.world.noise_px, calibration.sigma_px]
-    left = _rms(run.log.fit[run.steps, 1:2], 2.0 * views[-1:] - COORDINATES)[0]
-    untested = run.driven is not None and scenario.untested
-    ended = VERDICTS[run.verdict]
-    if ended.refutes or ended.retried or untested or left > _AGREES * max(noise):
+    if scenario.exact.goal.incidences or not _credible(run):  # a pose of incidences is one of many
         return {}
     numbers, q = scenario.numbers_of(run.law), run.log.read[run.steps]
     M = calibration.M[calibration.indices_of(numbers)]
@@ -208,7 +213,8 @@ def _incidences(run: LawRun) -> dict[str, Any]:
         if fit.settled:
             H[k] = as_array(fit.H)
     taught = images.displacements_taught(model)
-    left, each = _incidence_errors(run, images, H[-1], taught), np.arange(len(taught))
+    there = H[-1] if _credible(run) else np.full_like(H[-1], np.nan)
+    left, each = _incidence_errors(run, images, there, taught), np.arange(len(taught))
     flats = [[one.tool for one in images.goal.incidences], [one.scene for one in images.goal.incidences]]
     return {
         "feature_s": images_of(model, task.body.M, flats[0], H),

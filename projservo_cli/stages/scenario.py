@@ -182,11 +182,7 @@ class Scenario:
             images = images._replace(goal=images.goal.carried_to(self.s_carried))
         if asked is None:
             return images
-        if not len(images.body.M):
-            raise WorkFailed(
-                "a goal is displaced with the body, and the calibration is not usable: calibrate again, or "
-                "set control.features: body to try"
-            )
+        self.world.require_body("a goal is displaced")
         model, back = self.world.model, positioned(asked, self.world.numbers)
         s = images.s_start if asked.of_start else images.s_star
         H = images.displacement_at_start(model) if asked.of_start else images.displacement_at_goal(model)
@@ -265,11 +261,8 @@ def scenario_of(inputs: PlanInputs, calibration: Calibration) -> Scenario:
     if (task := inputs.task) is None:
         raise InputError("this stage needs a task: set task.start and task.goal")
     world = world_of(inputs, calibration)
-    if inputs.incidences and not len(world.body.M):
-        raise WorkFailed(
-            "incidences are measured with the body, and the calibration is not usable: calibrate again, or "
-            "set control.features: body to try"
-        )
+    if inputs.incidences:
+        world.require_body("incidences are measured")
     exact, q_goal = world.ends(task)
     exact = exact._replace(body=world.body, view=world.view)
     exact = exact.asking(_positions(inputs.incidences, world.numbers))

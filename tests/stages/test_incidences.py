@@ -6,13 +6,17 @@ from functools import cache
 import numpy as np
 import pytest
 
+from projservo_cli.findings import REFUSES, Finding
 from projservo_cli.records import InputError, WorkFailed
 from projservo_cli.report.animation import motion_of
 from projservo_cli.report.figures.scene import features_in_space
 from projservo_cli.report.report_data import REGISTER, Driven
 from projservo_cli.simulation.workspace import plant_of
 from projservo_cli.stages.plugin_law import PluginLaw
-from tests.configured import calibrate, plan, servo, truth_of
+from projservo_cli.stages.run_trace import trace_of
+from projservo_cli.stages.scenario import run_scenario
+from projservo_cli.stages.servo import drive
+from tests.configured import calibrate, plan, servo, servo_inputs, truth_of
 from tests.known import configured
 
 
@@ -60,6 +64,16 @@ def test_a_pin_goes_into_its_hole_and_the_rest_stays_free(law):
     assert seen_mm(trace).max() < 0.1 < trace.incidence_mm.max() < 0.5
 
 
+def test_no_error_is_stated_by_images_that_contradict_the_calibration():
+    """But of a tool that presses on something the images are as good as ever."""
+    config, calibration, planned = made()
+    run = drive(run_scenario(servo_inputs(config), calibration), planned, "exact_track")
+    run.verdict, run.why = "fault detected", Finding("moved_camera", REFUSES)
+    assert np.isnan(trace_of(run).incidence_mm).all()
+    run.why = Finding("pressed", REFUSES, amount=31.0, limit=30.0, unit="N")
+    assert np.isfinite(trace_of(run).incidence_mm).all()
+
+
 @pytest.mark.parametrize("law", ["stacked", "euclidean_points"])
 def test_laws_that_measure_points_go_to_a_pose_where_the_incidences_hold(law):
     """To that of the plan; they end above stop.image_error_px, which the errors of the calibration exceed."""
@@ -93,6 +107,12 @@ def test_features_of_tool_and_scene_are_drawn_where_they_are():
     for axes in drawn.axes[: len(trace.view)]:
         assert sum(line.get_label().startswith("features of the ") for line in axes.lines) == 3
     assert drawn.axes[2].get_title().startswith("pin on hole\nwithin 0.")
+    # A motion of a sequence has incidences of its own, and panels for them.
+    approach = replace(trace, incidences=("pin on hole (back)", "tip on bottom (back)"))
+    drawn = figure.drawn(figure.data(replace(material, traces={"exact_track": trace, "before": approach})))
+    titles = [axes.get_title().split("\n")[0] for axes in drawn.axes[2:]]
+    assert titles == [*trace.incidences, *approach.incidences]
+    assert [len(axes.lines) for axes in drawn.axes[2:]] == [1, 1, 1, 1]
     # The free motion turns the face about the pin, in truth too, and as its images say.
     (free,), (velocity,) = trace.free_motion, trace.free_s
     ends = [trace.q[-1] + by * free for by in (-0.01, 0.01)]

@@ -404,6 +404,7 @@ _FREE = style.line(style.PURPLE, width=1.4)
 _TITLES = 84  # characters of all titles in a row
 _ERRORS_HEIGHT = 3.2  # inches, of the panels of errors with titles and legend
 _LEAST_ASPECT = 0.55  # height over width of an image of features
+_PANELS = 4  # most panels of errors in a row
 
 
 def _feature_images(trace: Trace, instants: IntArray) -> Data:
@@ -414,7 +415,10 @@ def _feature_images(trace: Trace, instants: IntArray) -> Data:
 
 
 def _data_incidences(report_data: ReportData | Driven) -> Data:
-    """Images of features at both ends of a run, and the error of each incidence over time in all runs."""
+    """Images of features at both ends of a run, and the error of each incidence over time in all runs.
+
+    Motions of a sequence have incidences of their own: what a run does not ask for is NaN.
+    """
     name, shown = _shown_run(report_data, "feature_s")
     result: Data = {
         "run": np.array(title(name)),
@@ -423,18 +427,20 @@ def _data_incidences(report_data: ReportData | Driven) -> Data:
         "face_at_end": shown.s[-1],
         "view": np.array(shown.view),
         **_feature_images(shown, np.array([0, -1])),
-        **{
-            key: values
-            for key in ("incidence_mm", "incidence_deg", "free_motion", "free_s")
-            if (values := getattr(shown, key)) is not None
-        },
+        **{key: free for key in ("free_motion", "free_s") if (free := getattr(shown, key)) is not None},
     }
-    for name, trace in report_data.traces.items():
-        same = np.array_equal(result.get("incidence", trace.incidences), trace.incidences)
-        if trace.incidence_px is not None and same:  # of a sequence those of its first goal
-            result["incidence"] = np.array(trace.incidences)
+    asking = {name: trace for name, trace in report_data.traces.items() if trace.incidence_px is not None}
+    each = list(dict.fromkeys(name for trace in asking.values() for name in trace.incidences))
+    result["incidence"] = np.array(each)
+    stated = result["incidence_mm"], result["incidence_deg"] = np.full((2, len(each)), np.nan)
+    for name, trace in [*asking.items(), ("", shown)]:
+        own = [each.index(incidence) for incidence in trace.incidences]
+        for all_stated, one in zip(stated, (trace.incidence_mm, trace.incidence_deg), strict=True):
+            all_stated[own] = np.nan if one is None else one
+        if name and trace.incidence_px is not None:
             result[f"t_s_{name}"] = trace.period * np.arange(len(trace.incidence_px))
-            result[f"px_{name}"] = trace.incidence_px
+            result[f"px_{name}"] = np.full((len(trace.incidence_px), len(each)), np.nan)
+            result[f"px_{name}"][:, own] = trace.incidence_px
     return result
 
 
@@ -458,8 +464,11 @@ def _draw_incidences(data: Data, figure: "style.Figure") -> None:
         )
     ]
     height = _panel_width(len(names)) * style.aspect(np.concatenate(pixels), _LEAST_ASPECT)
-    figure.set_figheight(height + _ERRORS_HEIGHT)
-    grid = figure.add_gridspec(2, math.lcm(len(names), count), height_ratios=(height, _ERRORS_HEIGHT - 1.1))
+    rows = math.ceil(count / _PANELS)
+    across = math.ceil(count / rows)
+    figure.set_figheight(height + rows * _ERRORS_HEIGHT)
+    heights = height, *(_ERRORS_HEIGHT - 1.1,) * rows
+    grid = figure.add_gridspec(1 + rows, math.lcm(len(names), across), height_ratios=heights)
     images = _side_by_side(figure, grid, 0, len(names))
     for view, (panel, name) in enumerate(zip(images, names, strict=True)):
         for face in data["face"][:, view]:
@@ -476,25 +485,29 @@ def _draw_incidences(data: Data, figure: "style.Figure") -> None:
         run = f"{data['run']}, " if not view else ""
         left = f"{free or 'no'} joint motion{'s' * (free != 1)} free" if not view and free >= 0 else ""
         style.image_axes(panel, f"{name} camera" if view else f"{run}{left}\n{name} camera", pixels[view])
-    panels = _side_by_side(figure, grid, 1, count)
+    panels = [panel for row in range(rows) for panel in _side_by_side(figure, grid, 1 + row, across)]
+    for panel in panels[count:]:
+        panel.remove()
     runs = [name.removeprefix("px_") for name in data if name.startswith("px_")]
     errors = np.concatenate([np.maximum(data[f"px_{name}"], _LEAST_PX).ravel() for name in runs])
     lowest, highest = (bound(errors, initial=1.0, where=np.isfinite(errors)) for bound in (np.min, np.max))
-    for k, (panel, incidence) in enumerate(zip(panels, data["incidence"], strict=True)):
+    for k, (panel, incidence) in enumerate(zip(panels, data["incidence"], strict=False)):
         for i, name in enumerate(runs):
             error = np.maximum(data[f"px_{name}"][:, k], _LEAST_PX)
-            panel.plot(data[f"t_s_{name}"], error, **style.curve(i, title(name)))
+            if np.isfinite(error).any():
+                panel.plot(data[f"t_s_{name}"], error, **style.curve(i, title(name)))
         style.log_scale(panel)
-        heading = textwrap.fill(str(incidence), _TITLES // count) + _within(data, k)
+        heading = textwrap.fill(str(incidence), _TITLES // across) + _within(data, k)
         panel.set(title=heading, xlabel="time (s)", ylim=(0.5 * lowest, 2.0 * highest))
-    panels[0].set_ylabel("error (px at one px of noise)")
+    for panel in panels[:count:across]:
+        panel.set_ylabel("error (px at one px of noise)")
     style.legend_below(figure, 4)
 
 
 def _within(data: Data, k: int) -> str:
     """Error of an incidence as it is stated at the end, in words; empty if it is unknown."""
     units = ("incidence_mm", " mm"), ("incidence_deg", "°")
-    said = [f"{data[key][k]:.2g}{unit}" for key, unit in units if key in data and np.isfinite(data[key][k])]
+    said = [f"{data[key][k]:.2g}{unit}" for key, unit in units if np.isfinite(data[key][k])]
     return f"\nwithin {', '.join(said)}" if said else ""
 
 

@@ -100,6 +100,14 @@ class CalibratedWorld:
         points = measures_points(self.inputs.features, self.calibration)
         return NO_BODY if points else _body(self.calibration, self.numbers)
 
+    def require_body(self, what: str) -> None:
+        """Refuse what takes the body, where the face is measured point by point, with a WorkFailed."""
+        if not len(self.body.M):
+            raise WorkFailed(
+                f"{what} with the body, and the calibration is not usable: calibrate again, or set "
+                "control.features: body to try"
+            )
+
     @property
     def goal_images(self) -> GoalImages | None:
         """Images of the goal that are given."""

@@ -82,7 +82,7 @@ def given_pixels(
 
 def positioned(asked: StandOff, numbers: Sequence[int]) -> StandOff:
     """Displacement by positions in the body instead of numbers of markers; raises as ``in_body``."""
-    return asked._replace(along=in_body(asked.along, numbers, f"displaced: {asked.name}"))
+    return asked._replace(along=in_body(asked.along, numbers, f"task.goal.displaced: {asked.name}"))
 
 
 def in_body(points: Flat, numbers: Sequence[int], name: str) -> Flat:
