@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 from projservo_cli.image_size import BEHIND
+from projservo_cli.planning.constraints import constraints_of
 from projservo_cli.planning.margins import (
+    along_joints,
     along_shares,
     image_margin,
     joint_margin,
@@ -15,9 +17,11 @@ from projservo_cli.planning.margins import (
     limits_alone,
 )
 from projservo_cli.planning.product_space import shortest, widest
+from projservo_cli.planning.rrt_connect import margins_at
 from projservo_cli.planning.time_parameterization import minimum_time
 from projservo_cli.records import position_limits
 from tests.planning.cases import reaching_of
+from tests.planning.columns import FRONT, IMAGE, VISIBILITY
 from tests.samples import pixels
 from tests.stages.cases import case
 
@@ -50,6 +54,22 @@ def test_margins_of_the_views_are_those_of_the_displaced_face(name):
         wanted = (border.min() - 20.0) / (0.5 * size.min() - 20.0)
         assert image_margin(reaching.demands, found.distance[i].min()) == pytest.approx(wanted, abs=1e-9)
         assert found.margins[i, 1] == pytest.approx(wanted, abs=1e-9)
+
+
+@pytest.mark.parametrize("name", ["paper", "ur5"])
+def test_margins_of_a_motion_are_those_of_its_joints(name):
+    """What profiles of the paper are measured against is what a search through joint space keeps to."""
+    example, reaching = case(name), reaching_of(name)
+    task, start = example.ends.task(example.truth.model), reaching.q_start
+    c = constraints_of(reaching.model, reaching.A, task, start, reaching.demands)
+    q = start + np.random.default_rng(4).uniform(-0.5, 0.5, (200, len(start)))
+    found, shown = along_joints(reaching, q).along, 0
+    for k, margins in enumerate(margins_at(c, joints)[0] for joints in q):
+        np.testing.assert_allclose(found.visibility[k], margins[VISIBILITY : VISIBILITY + 2], atol=1e-9)
+        if (margins[FRONT : FRONT + 2] > 0.0).all():
+            np.testing.assert_allclose(found.distance[k], margins[IMAGE : IMAGE + 2], atol=1e-7)
+            shown += 1
+    assert shown > 100
 
 
 def test_a_marker_behind_a_camera_is_as_far_outside_as_can_be():
