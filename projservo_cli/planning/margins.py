@@ -29,12 +29,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from projservo_cli.geometry.algebra import Mat4, Vec4, apply, axpy, dot, mat, mat_into, meet, mul, vec
+from projservo_cli.geometry.algebra import Mat4, Vec4, apply, mat, mat_into, meet, mul, vec
 from projservo_cli.geometry.jit import inline, internal, merged, njit, separate
 from projservo_cli.geometry.kernels import COORDINATES, orthogonalize, row_into
 from projservo_cli.geometry.kinematics import (
     backward,
-    forward,
     image_velocity,
     limit_distance,
     operators_at,
@@ -54,7 +53,6 @@ from projservo_cli.geometry.mechanisms import (
 from projservo_cli.image_size import BEHIND, border_distance
 from projservo_cli.records import VIEWS, FloatArray, IntArray, JointLimits, Model
 from projservo_cli.task.trajectory import displaced
-from projservo_cli.task.visibility import margin_coefficients
 
 # Kinds of constraints. Margins of joints have a column of each, and one a view where each camera has its own;
 # the last one is of a motion between them alone.
@@ -192,22 +190,6 @@ class Motion(NamedTuple):
 
 
 @merged
-def _visibility(reaching: Reaching, view: int, mu_t: float, mu_r: float) -> float:
-    """Margin of one camera: the dual motion of its optical centre against the plane, [RH00] section 4.2.
-
-    The translation carries the centre along a line, the rotation within the plane leaves the plane as
-    it is: for every share μ_t the margin is c_0 + c_s sin θ + c_c cos θ with coefficients affine in μ_t.
-    """
-    O = vec(reaching.O[view])
-    a = vec(reaching.a)
-    moved = axpy(-mu_t * float(reaching.amplitudes[0]), apply(mat(reaching.H_hat[0]), O), O)
-    c_0, c_s, c_c = margin_coefficients(a, mat(reaching.H_hat[1]), moved)
-    theta = mu_r * float(reaching.amplitudes[1])
-    side: float = reaching.visible[view] * (c_0 + c_s * math.sin(theta) + c_c * math.cos(theta))
-    return side / abs(dot(a, O))
-
-
-@merged
 def straight_pixel(P: FloatArray, A: Vec4) -> tuple[float, float]:
     """Pixel of a point by a projective camera, [RH00] eq. (1)."""
     depth = row(P, 2, A)
@@ -327,22 +309,20 @@ def _reciprocal_condition(carrier: Carrier, H: Mat4) -> float:
     return last / first if first > 0.0 else 0.0
 
 
-@merged
-def displacement_into(reaching: Reaching, mu: FloatArray, along: Along, i: int) -> None:
-    """Write displacement and visibility of one instant, at shares (3,)."""
-    mat_into(along.H_d[i], displaced(reaching.H_hat, reaching.amplitudes, mu[0], mu[1], mu[2]))
-    for view in range(reaching.O.shape[0]):
-        along.visibility[i, view] = _visibility(reaching, view, mu[0], mu[1])
+@njit
+def displacements_into(reaching: Reaching, mu: FloatArray, along: Along) -> None:
+    """Write the displacements at shares mu (s, 3)."""
+    for i in range(mu.shape[0]):
+        mat_into(along.H_d[i], displaced(reaching.H_hat, reaching.amplitudes, mu[i, 0], mu[i, 1], mu[i, 2]))
 
 
 @njit
 def carried_into(carrier: Carrier, mu: FloatArray, along: Along) -> None:
-    """Write all but images and margins at shares mu (s, 3), from the joints at the first on.
+    """Write displacements, joints, limit and condition at shares mu (s, 3), from the joints at the first on.
 
     Where the joints would move too far between two of them, the path is made in parts.
     """
-    for i in range(mu.shape[0]):
-        displacement_into(carrier.reaching, mu[i], along, i)
+    displacements_into(carrier.reaching, mu, along)
     for i in range(mu.shape[0]):
         before = max(0, i - 1)
         parts = 0 if i == 0 else 1
@@ -361,20 +341,14 @@ def carried_into(carrier: Carrier, mu: FloatArray, along: Along) -> None:
 
 @njit
 def _moved_into(carrier: Carrier, along: Along) -> None:
-    """Write displacement, visibility, limit and condition at joints (s, n), by the forward kinematics."""
+    """Write displacement, limit and condition at joints (s, n), by the forward kinematics."""
     reaching, model = carrier.reaching, carrier.reaching.model
-    a, start = vec(reaching.a), forward(model, reaching.q_start)
     back = backward(model, reaching.q_start)
     for i in range(along.q.shape[0]):
         H = mul(operators_at(model, along.q[i], carrier.work.H_hat), back)
         mat_into(along.H_d[i], H)
         along.condition[i] = _reciprocal_condition(carrier, H)
         along.limit[i] = limit_margin(reaching.demands, along.q[i])
-        H_back = mul(start, backward(model, along.q[i]))
-        for view in range(reaching.O.shape[0]):
-            O = vec(reaching.O[view])
-            side = reaching.visible[view] * dot(a, apply(H_back, O))
-            along.visibility[i, view] = side / abs(dot(a, O))
 
 
 def along_shares(reaching: Reaching, mu: FloatArray, q: FloatArray | None = None) -> Motion:
@@ -394,10 +368,17 @@ def along_joints(reaching: Reaching, q: FloatArray) -> Motion:
 
 
 def measured(motion: Motion) -> Motion:
-    """The motion with its images, distances and margins, where all else is known."""
+    """The motion with its images, visibility, distances and margins, where all else is known.
+
+    Visibility is the dual motion of the optical centres against planes, [RH00] section 4.2. Of tags it and
+    the distance are those of the tag that keeps them best.
+    """
     reaching, along = motion.reaching, motion.along
     demands, model, m = reaching.demands, reaching.model, len(reaching.A)
-    A = reaching.body if len(demands.tags) else reaching.A
+    A, tags, planes = reaching.A, np.arange(m)[None], reaching.a[None]
+    if len(demands.tags):
+        A, tags = reaching.body, demands.tags
+        planes = tag_planes(tags, A, m, reaching.a)
     M = A @ np.swapaxes(along.H_d, 1, 2)
     s = np.moveaxis(project(model.P, M, model.lens), 0, 1)
     along.s[:] = s[:, :, :m]
@@ -406,12 +387,14 @@ def measured(motion: Motion) -> Motion:
     visible = np.swapaxes((M @ model.P[:, 2].T) * depth > 1e-9 * depth**2, 1, 2)
     border = border_distance(s, demands.image_size[:, None])
     border = np.where(visible & np.isfinite(border), border, BEHIND)
-    along.distance[:] = border[:, :, :m].min(axis=2)
-    if len(demands.tags):
-        _best_tag_into(reaching, border, along)
-    visibility, distance = best_views(demands, along.visibility, along.distance)
-    along.margins[:, OF_MOTION.index(VISIBILITY)] = visibility.min(axis=-1)
-    along.margins[:, OF_MOTION.index(IMAGE)] = image_margin(demands, distance.min(axis=-1))
+    scale = reaching.visible * np.abs(reaching.O @ reaching.a)
+    side = planes @ np.linalg.inv(along.H_d) @ (reaching.O / scale[:, None]).T
+    distance = border[:, :, tags].min(axis=3).swapaxes(1, 2)  # (s, t, V) both
+    kept = np.stack([views.min(axis=2) for views in best_views(demands, side, distance)])
+    kept[1] = image_margin(demands, kept[1])
+    best = np.arange(len(s)), kept.min(axis=0).argmax(axis=1)
+    along.visibility[:], along.distance[:] = side[best], distance[best]
+    along.margins[:, [OF_MOTION.index(VISIBILITY), OF_MOTION.index(IMAGE)]] = kept[:, *best].T
     joint_margins_into(demands, along)
     return motion
 
@@ -444,16 +427,3 @@ def tag_planes(tags: IntArray, body: FloatArray, m: int, a: FloatArray) -> Float
     planes = np.array([meet(A, B, C) for A, B, C, _ in corners])
     face = planes[(tags < m).all(axis=1)][0]
     return np.asarray(planes * (float(a @ face) / float(face @ face)))
-
-
-def _best_tag_into(reaching: Reaching, border: FloatArray, along: Along) -> None:
-    """Write visibility and distance of the tag that keeps them best, of distances (s, V, b) of markers."""
-    tags = reaching.demands.tags
-    planes = tag_planes(tags, reaching.body, len(reaching.A), reaching.a)
-    scale = reaching.visible * np.abs(reaching.O @ reaching.a)
-    back = np.linalg.inv(along.H_d) @ (reaching.O / scale[:, None]).T
-    side, distance = planes @ back, border[:, :, tags].min(axis=3).swapaxes(1, 2)  # (s, t, V) both
-    sides, distances = best_views(reaching.demands, side, distance)
-    worst = np.minimum(sides.min(axis=2), image_margin(reaching.demands, distances.min(axis=2)))
-    best = np.arange(len(worst)), worst.argmax(axis=1)
-    along.visibility[:], along.distance[:] = side[best], distance[best]

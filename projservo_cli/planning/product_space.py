@@ -26,7 +26,7 @@ from projservo_cli.planning.margins import (
     along_shares,
     carrier_of,
     carry_joints,
-    displacement_into,
+    displacements_into,
     joint_margins_into,
     limit_margin,
     measured,
@@ -151,7 +151,7 @@ def _in_view(reaching: Reaching, size: int) -> _Lattice:
     """A lattice of the views alone, with so many values of each share."""
     mu = np.ascontiguousarray(np.indices((size, size, size)).reshape(3, -1).T / (size - 1.0))
     along = room_along(reaching, len(mu))
-    _displacements_into(reaching, mu, along)
+    displacements_into(reaching, mu, along)
     return _Lattice(measured(Motion(reaching, mu, along)), False)
 
 
@@ -261,12 +261,6 @@ def _shortest_into(
                 total += _STRAIGHTER * math.sqrt(axes)
                 if total < cost[node]:
                     cost[node], came[node] = total, before
-
-
-@njit
-def _displacements_into(reaching: Reaching, mu: FloatArray, along: Along) -> None:
-    for i in range(mu.shape[0]):
-        displacement_into(reaching, mu[i], along, i)
 
 
 @njit
