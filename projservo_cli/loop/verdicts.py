@@ -223,17 +223,23 @@ def on_plateau(errors: FloatArray, k: int, window: int) -> bool:
     return bool(k >= window and errors[k] > (1.0 - PLATEAU_FALL) * errors[k - window])
 
 
-def plateau_stretch(errors: FloatArray, window: int) -> tuple[int, int] | None:
-    """First and last instant of the longest stretch in which the plateau test holds from its window on.
+def plateau_stretches(errors: FloatArray, window: int) -> IntArray:
+    """First and last instants (k, 2) of the stretches in which the plateau test holds from its window on.
 
     errors : (k,) errors that a run is judged by, px; window : of the test, steps.
     """
     flat = errors[window:] > (1.0 - PLATEAU_FALL) * errors[:-window]
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flat, [False]])))
-    if not len(edges):
+    return np.asarray(edges.reshape(-1, 2) + np.array([0, window - 1]))
+
+
+def plateau_stretch(errors: FloatArray, window: int) -> tuple[int, int] | None:
+    """First and last instant of the longest of these stretches; None without any."""
+    each = plateau_stretches(errors, window)
+    if not len(each):
         return None
-    first, end = edges.reshape(-1, 2)[np.argmax(edges[1::2] - edges[::2])]
-    return int(first), int(end) - 1 + window
+    first, last = each[np.argmax(each[:, 1] - each[:, 0])].tolist()
+    return first, last
 
 
 class Command(NamedTuple):

@@ -31,7 +31,7 @@ _IMAGE = "image"  # label of axes that show pixels
 BLACK, ORANGE, BLUE, SKY = "#000000", "#E69F00", "#0072B2", "#56B4E9"
 VERMILION, GREEN, PURPLE = "#D55E00", "#009E73", "#CC79A7"
 # Of further cameras: the other colours have their meaning in the same figures.
-_BROWN, _VIOLET = "#7F4F24", "#5E3C99"
+_BROWN, VIOLET = "#7F4F24", "#5E3C99"
 GREY, PALE = "#999999", "#DDDDDD"
 SOLID, NO_LINE = "-", "none"
 DASHED, DOTTED, DASH_DOTTED = (0, (5, 1.5)), (0, (1, 1)), (0, (5, 1.5, 1, 1.5))
@@ -75,7 +75,7 @@ LAW_LINES = {
 HIDDEN = line(ORANGE, width=4.0, label="face hidden from this camera", alpha=0.6, solid_capstyle="butt")
 # Colour and dashes of the views, the same in every figure; from the fifth view on they come again.
 _VIEWS: tuple[tuple[str, Any], ...] = (
-    *((BLUE, SOLID), (ORANGE, DASHED), (_BROWN, DASH_DOTTED), (_VIOLET, (0, (3, 1, 1, 1, 1, 1)))),
+    *((BLUE, SOLID), (ORANGE, DASHED), (_BROWN, DASH_DOTTED), (VIOLET, (0, (3, 1, 1, 1, 1, 1)))),
 )
 _FIRST_MARKER = 3.0  # size of the dot on the first marker of a face, points
 
@@ -133,7 +133,7 @@ def drawn(draw: Callable[[Any, "Figure"], None], data: Any, height: float, width
     from matplotlib.layout_engine import TightLayoutEngine
 
     # Without a rectangle it measures each part once; with one, or "constrained", twice, which takes 0.6 s.
-    layout: Any = TightLayoutEngine(pad=0.5, rect=None)  # type: ignore[arg-type]
+    layout: Any = TightLayoutEngine(pad=0.5, w_pad=1.2, rect=None)  # type: ignore[arg-type]
     with styled():
         figure = Figure(figsize=(width, height), layout=layout)
         FigureCanvasAgg(figure)

@@ -123,7 +123,7 @@ def test_the_plateau_that_is_drawn_and_claimed_is_that_of_the_verdict():
         self_occluded=np.zeros((count, 2), dtype=bool),
     )
     shown = dataclasses.replace(material, traces={"stacked": still}, stall_periods=5)
-    assert SPECS["fig04_classical"].data(shown)["plateau_stacked"].tolist() == [10, 29]
+    assert SPECS["fig04_classical"].data(shown)["plateau_stacked"].tolist() == [[10, 29]]
     (claim,) = [c for c in claims_of(shown, None) if "local minimum" in c.claim]
     assert claim.measured.startswith("19 steps from step 10 at 30 px")
     assert claim.criterion.startswith("image error falls < 1 % in 5 steps")

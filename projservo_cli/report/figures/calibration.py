@@ -208,13 +208,15 @@ def _expected_residual(predicted: FloatArray, sigma: float) -> FloatArray:
 def _draw(data: Data, figure: "style.Figure") -> None:
     """Residuals over the images; their histogram and error of each pose; excitation and information."""
     views = [name.removeprefix("seen_") for name in data if name.startswith("seen_")]
-    grid = figure.add_gridspec(3, 2, height_ratios=(1.15, 1.0, 0.9))
-    images = grid[0, :].subgridspec(1, len(views))
-    cameras = [figure.add_subplot(images[0, v]) for v in range(len(views))]
+    grid, cells = style.images_above(figure, len(views), (1.15, 1.0, 0.9))
+    cameras = [figure.add_subplot(cell) for cell in cells]
     for axes, view in zip(cameras, views, strict=True):
         _arrows(axes, data, view, style.separator(len(views)))
     style.name_first_ordinate(cameras)
-    panels = [[figure.add_subplot(grid[i, j]) for j in (0, 1)] for i in (1, 2)]
+    half = grid.ncols // 2
+    panels = [
+        [figure.add_subplot(grid[i, columns]) for columns in (slice(half), slice(half, None))] for i in (1, 2)
+    ]
     _histogram(panels[0][0], data)
     _poses(panels[0][1], data)
     _excitation(panels[1][0], data)
@@ -222,7 +224,7 @@ def _draw(data: Data, figure: "style.Figure") -> None:
     notes = [
         _RESIDUAL | {"label": f"residual, {data['factor']:,g} times"},
         style.line(style.PALE, width=6, label="95 % of poses in the model"),
-        _WEAK,
+        *[_WEAK] * bool(data["weak"].any()),
     ]
     style.legend_below(figure, 3, notes)
 
@@ -304,7 +306,7 @@ def _excitation(axes: "style.Axes", data: Data) -> None:
 def _spectrum(axes: "style.Axes", data: Data) -> None:
     """Information along each direction that the images determine, falling; the last is the worst."""
     values = data["information"]
-    title = f"information, {len(values)} of {int(data['parameters'])} directions free"
+    title = f"information, {len(values)} directions of {int(data['parameters'])} numbers"
     axes.set(title=title, xlabel="direction (best to worst)", ylabel="eigenvalue (1)")
     if values.size:
         line = style.line(style.BLUE, width=0.8, marker="o", markersize=2.5)

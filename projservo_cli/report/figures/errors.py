@@ -29,6 +29,7 @@ _TRANSLATION = {
     "tau": style.line(style.VERMILION, style.DASHED, label=_KERNEL + "projective"),
     "tau_metric": style.line(style.BLACK, style.DOTTED, label=_KERNEL + "Euclidean"),
 }
+_THIN = 0.6  # points, of differences with true operators
 _HIDES = 3.0  # times the step of the slower half of the joints, beyond which a step hides theirs
 _LIMIT = style.line(style.GREY, width=0.8)
 _RUN_PATH = style.line(style.GREY, width=0.8, label="path of a marker")
@@ -139,24 +140,24 @@ def _draw_three(data: Data, figure: "style.Figure") -> None:
     off.set(title="its difference from the true distance", ylabel="difference (% of the start)")
     rotation.set(title="rotation errors", xlabel="time (s)", ylabel="angle (deg)")
     difference.set(title="projective less Euclidean model", xlabel="time (s)", ylabel="difference (deg)")
-    dotted = style.line(style.BLACK, style.DOTTED, label="dotted difference: true operators")
-    style.legend_below(figure, 2, [dotted])
+    thin = style.line(style.GREY, width=_THIN, label="thin difference: true operators")
+    style.legend_below(figure, 2, [thin])
 
 
 def _rotations(rotation: "style.Axes", difference: "style.Axes", data: Data) -> None:
-    """Draw θ_r and θ_p with both models, and how far these differ, dotted with true operators."""
+    """Draw θ_r and θ_p with both models, and how far these differ, thin with true operators."""
     t, t_metric = data["t_s"], data["t_s_metric"]
     t_common = max(t, t_metric, key=len)
     markers = {"fillstyle": "none", "markevery": max(1, len(t_metric) // 25)}
-    for name, color, marker in (("theta_r", style.BLACK, "o"), ("theta_p", style.VERMILION, "s")):
+    for name, color, marker in (("theta_r", style.GREEN, "o"), ("theta_p", style.PURPLE, "s")):
         angle = rf"$\{name}$"
         rotation.plot(t, data[f"{name}_deg"], color=color, label=f"{angle}, projective model")
         euclidean = style.dots(color, marker, f"{angle}, Euclidean model", **markers)
         rotation.plot(t_metric, data[f"{name}_deg_metric"], **euclidean)
-        for kind, dash in (("calibrated", style.SOLID), ("true", style.DOTTED)):
+        for kind, width in (("calibrated", None), ("true", _THIN)):
             curve = data[f"{name}_difference_deg_{kind}"]
             shown = style.positive(curve)
-            difference.plot(t_common[: len(curve)], shown, color=color, linestyle=dash)
+            difference.plot(t_common[: len(curve)], shown, **style.line(color, width=width))
 
 
 def _enlarge(axes: "style.Axes", t: FloatArray, steps: FloatArray, chosen: list[int]) -> None:

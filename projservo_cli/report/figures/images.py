@@ -9,7 +9,7 @@ import numpy as np
 
 from projservo_cli.geometry.kinematics import project
 from projservo_cli.laws import BODY_LAWS, POINT_LAWS, title_of
-from projservo_cli.loop.verdicts import plateau_stretch
+from projservo_cli.loop.verdicts import plateau_stretches
 from projservo_cli.records import CORNERS, ByteArray, FloatArray, IntArray, Trace
 from projservo_cli.report import style
 from projservo_cli.report.report_data import DIRECT, Data, Driven, ReportData, percent, registered, title
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 _PANELS_WIDTH, _PANEL_WIDTH = 5.8, 3.6  # inches, of all panels side by side, and of one at most
 _PATH = style.line(style.BLACK, width=0.9, label="path of a marker")
-_PLATEAU = style.line(style.VERMILION, width=2.0, marker="s", label="plateau of the image error")
+_PLATEAU = style.line(style.VERMILION, width=2.0, marker="s", label="plateau of the error")
 _STOPPED = style.dots(style.BLACK, "x", "end of the run", markersize=4)
 
 
@@ -31,12 +31,11 @@ def _data_classical(report_data: ReportData) -> Data:
     for law in POINT_LAWS:
         if law in report_data.traces:
             trace = report_data.traces[law]
-            stretch = plateau_stretch(trace.convergence_error, report_data.stall_periods)
             result |= {
                 f"s_{law}": trace.s[:, :, order],
                 f"s_star_{law}": trace.s_star[:, order],
                 f"hidden_{law}": trace.self_occluded,
-                f"plateau_{law}": np.array(stretch if stretch is not None else (-1, -1)),
+                f"plateau_{law}": plateau_stretches(trace.convergence_error, report_data.stall_periods),
                 f"verdict_{law}": np.array(f"{trace.verdict}, {trace.steps} steps"),
             }
     return result | {"view": np.array(report_data.view)}
@@ -70,12 +69,11 @@ def _draw_classical(data: Data, figure: "style.Figure") -> None:
     figure.set_figheight(sum(heights) + titles * len(laws) + 0.45)
     axes = figure.subplots(len(laws), len(names), squeeze=False, height_ratios=heights)
     for row, law, pixels in zip(axes, laws, near, strict=True):
-        first, last = data[f"plateau_{law}"]
         for view, (panel, name) in enumerate(zip(row, names, strict=True)):
             s = data[f"s_{law}"][:, view]
             style.paths(panel, s, style.HIDDEN, mask=data[f"hidden_{law}"][:, view])
             style.paths(panel, s, _PATH)
-            if first >= 0:
+            for first, last in data[f"plateau_{law}"]:
                 style.paths(panel, s[first : last + 1], _PLATEAU | {"markevery": [0]})
             panel.plot(*s[-1].T, **_STOPPED)
             style.start_and_goal(panel, s[0], data[f"s_star_{law}"][view])

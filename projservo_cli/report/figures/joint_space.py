@@ -29,8 +29,9 @@ _TREES = {
 _HATCHED: Any = {"edgecolor": style.VERMILION, "hatch": "////", "linewidth": 0.6}
 _KEPT_OUT = style.patch("none", "kept-out region", **_HATCHED)
 _REQUIRED = style.line(style.GREY, style.DOTTED, 0.8, label="asked for")
+_RANGE: Any = {"linewidth": 3.0, "solid_capstyle": "butt"}  # a projecting cap would lengthen the range
 _SHARES = {
-    "visibility": style.line(style.BLUE, label="visibility a·O (start = 1)"),
+    "visibility": style.line(style.VIOLET, label="visibility a·O (start = 1)"),
     "joints": style.line(style.GREEN, label="nearest joint limit (middle = 1)"),
     "conditioning": style.line(style.PURPLE, label="conditioning (start = 1)"),
 }
@@ -152,7 +153,7 @@ def _draw(data: Data, figure: "style.Figure") -> None:
     ]
     if len(names) > 1:
         notes[0]["label"] += ", or both" if len(names) == 2 else ", or all"
-    notes.append(_REQUIRED)
+    notes += [_REQUIRED, style.line(style.GREY, label="range of a joint", **_RANGE)]
     if "nodes" in data and data["nodes"][0] < data["nodes"][1]:
         stored = "{} of {} joint vectors of trees".format(*data["nodes"])
         notes.append(style.line(style.GREY, style.NO_LINE, label=stored))
@@ -207,7 +208,6 @@ def _joints(axes: "style.Axes", data: Data, chosen: list[int], unit: str) -> Non
     values = values[np.isfinite(values)]
     low, high = (float(values.min()), float(values.max())) if len(values) else (-1.0, 1.0)
     pad = 0.06 * max(high - low, 1e-3)
-    bar: Any = {"linewidth": 3.0, "solid_capstyle": "butt"}  # a projecting cap would lengthen the range
     named: Any = {"ha": "center", "va": "bottom", "fontsize": 6.5}
     for begin, until in data["corner_s"]:
         axes.axvspan(begin, until, color=style.PALE, linewidth=0)
@@ -215,7 +215,7 @@ def _joints(axes: "style.Axes", data: Data, chosen: list[int], unit: str) -> Non
     for place, i in enumerate(chosen):
         line, x = style.curve(i), end * (1.0 + _STRIP * (place + 0.7))
         axes.plot(t, q[:, i], **line)
-        axes.plot([x, x], np.clip(limits[:, i], low - pad, high + pad), color=line["color"], **bar)
+        axes.plot([x, x], np.clip(limits[:, i], low - pad, high + pad), color=line["color"], **_RANGE)
         axes.text(x, high + 1.5 * pad, "q" + str(i + 1).translate(_SUBSCRIPTS), **named)
     colors = [style.curve(i)["color"] for i in chosen]
     axes.scatter(np.zeros(len(chosen)), data["q_start_deg_or_mm"][chosen], 9.0, colors)

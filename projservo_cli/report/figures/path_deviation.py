@@ -14,7 +14,7 @@ from projservo_cli.words.reasons import arrived
 _PATH_POINTS = 400
 _WHIRL = np.pi  # with a longer joint step, rad or m, the arm winds up: its path is drawn at the instants only
 _WIDE = 10.0  # modes that differ more have a logarithmic scale, down to a fraction of the smallest
-_LEAST_OF_MODES = 0.02
+_LEAST_SHOWN = 0.02
 _ALONG, _OFF = "way along the straight line (mm)", "distance from it (mm)"
 _RESOLUTION = np.radians(1.0)  # longest joint motion, rad or m, between two points of a drawn path
 _OPERATORS = ("true", "calibrated")
@@ -104,16 +104,19 @@ def _draw(data: Data, figure: "style.Figure") -> None:
     gains, limit = data["gain"], f"{float(data['step_limit_deg']):g}° per step"
     lines = [
         *(style.curve(i, f"gain {gain:g} per step") for i, gain in enumerate(gains)),
-        style.line(style.SKY, width=2.4, label=f"{gains.max():g} and {limit}"),
+        style.line(
+            style.SKY, width=2.8, label=f"{gains.max():g} and {limit}", zorder=1.5
+        ),  # below the others
     ]
     axes = figure.subplots(2, 2, width_ratios=[1.5, 1])
     for (path_axes, gain_axes), deviation, law in zip(axes, data["path_deviation_mm"], DIRECT, strict=True):
         paths = [data[f"path_mm_{law}_{i}"] for i in range(len(lines))]
         for path, line in zip(paths, lines, strict=True):
-            path_axes.plot(*path.T, **line)
+            path_axes.plot(path[:, 0], style.positive(path[:, 1]), **line)
         path_axes.set(title=f"{title_of(law)}: path of the centre, calibrated operators")
         path_axes.set(xlabel=_ALONG, ylabel=_OFF)
-        path_axes.set_ylim(bottom=0.0)
+        style.log_scale(path_axes)
+        path_axes.set_ylim(bottom=_LEAST_SHOWN * min(float(path[:, 1].max()) for path in paths))
         for (operators, limited), line in _MAXIMA.items():
             label = f"{_OPERATORS[operators]}, {limit if limited else 'no limit'}"
             size = 4.5 if operators else 3.0  # an empty marker shows around a full one
@@ -184,5 +187,5 @@ def _draw_modes(data: Data, figure: "style.Figure") -> None:
     axes.set(title="path of the centre", xlabel=_ALONG, ylabel=_OFF)
     if wide:
         style.log_scale(axes)
-        axes.set_ylim(bottom=_LEAST_OF_MODES * min(upper))
+        axes.set_ylim(bottom=_LEAST_SHOWN * min(upper))
     style.legend_below(figure, 2)

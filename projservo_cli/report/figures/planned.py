@@ -234,9 +234,9 @@ _REGIONS = {  # hatched, so that they differ in grey too
     "border_px": style.patch(style.ORANGE, r"outside this image at every $\mu_p$", hatch="////", **_HATCHED),
 }
 _MARGINS = (
-    style.line(style.BLUE, label="visibility"),
-    style.line(style.ORANGE, style.DASHED, label="image"),
-    style.line(style.GREEN, (0, (4, 1, 1, 1)), label="joints"),
+    style.line(style.BLUE, label="visibility, worst camera"),
+    style.line(style.ORANGE, style.DASHED, label="image border, worst camera"),
+    style.line(style.GREEN, (0, (4, 1, 1, 1)), label="nearest joint limit"),
     style.line(style.PURPLE, style.DOTTED, label="conditioning (start = 1)"),
 )
 
@@ -446,7 +446,8 @@ def _draw_path(data: Data, figure: "style.Figure") -> None:
         style.near_zero_scale(margins, 1.0)
     margins.set_ylim(bottom=min(-0.1, 1.1 * float(np.nanmin(data["along"]))))
     path = _PATH | {"marker": "o", "label": r"path, at tenths of $\sigma$"}
-    style.legend_below(figure, 4, [*_REGIONS.values(), path])
+    shown = [line for name, line in _REGIONS.items() if data[name].min() < 0.0]
+    style.legend_below(figure, 4, [*shown, path])
 
 
 def _map(axes: "style.Axes", data: Data, view: int) -> None:

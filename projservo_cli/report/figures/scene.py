@@ -341,7 +341,7 @@ def _data_metric(report_data: Fit) -> Data:
 
 @registered(
     "fig18_metric",
-    "SerialArm, cameras and the tool's uncertainty, to scale",
+    "Arm, cameras and the tool's uncertainty, to scale",
     "not in the paper",
     _data_metric,
     height=4.4,
