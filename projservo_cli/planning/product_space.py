@@ -167,7 +167,8 @@ def _with_joints(view: _Lattice) -> _Lattice:
 def _quickest(lattice: _Lattice) -> Motion:
     """Quickest path among those of the largest smallest share, in straight pieces."""
     value = widest(lattice.minimum(lattice.nodes))
-    corners = _straightened(lattice, shortest(value >= value[-1], *lattice.moved(lattice.nodes)))
+    free = value >= value[-1] - _ROUND_OFF  # no turn within the plane changes visibility
+    corners = _straightened(lattice, shortest(free, *lattice.moved(lattice.nodes)))
     length = np.r_[0.0, np.cumsum(np.abs(np.diff(corners, axis=0)).max(axis=1))]
     positions = np.linspace(0.0, length[-1], _CHECKS)
     mu = np.stack([np.interp(positions, length, column) for column in corners.T], axis=1)
