@@ -195,7 +195,7 @@ def calibrate(
     Parameters
     ----------
     observations : of ``simulate``, ``record``, or of your arrays and tables.
-    method : ``bundle_adjustment`` (maximum likelihood) or ``closed_form`` (the paper's closed forms).
+    method : ``bundle_adjustment``, maximum likelihood, the only one.
     lens : whether to estimate radial distortion: two coefficients a camera, and its centre where it shows.
     init : JSON file of a robot and rig known beforehand, tried first as a start.
     cross_validate : parts into which poses are divided to predict each from the others; the held-out errors
@@ -247,7 +247,6 @@ def calibrate(
         seen = replace(seen, seed=settings.seed)
     file = None if settings.init is None else File.of(settings.init, "JSON with screws, cameras and markers")
     asked = Estimation(
-        settings.method,
         settings.lens,
         file,
         settings.cross_validate,

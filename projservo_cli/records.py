@@ -400,7 +400,7 @@ class ProjectiveKinematics:
 
     @property
     def has_covariance(self) -> bool:
-        """Whether the method says how far it is off."""
+        """Whether it says how far it is off; that of a truth, which is not off, does not."""
         return bool(np.isfinite(self.sqrt_cov_shared).all())
 
     def indices_of(self, numbers: Iterable[int]) -> list[int]:
@@ -543,7 +543,7 @@ class Calibration(StatedErrors, Rejections, FitQuality, ProjectiveKinematics):
     Points are scaled to ``a_inf @ M = 1``, so that the mean of points is their midpoint.
     """
 
-    method: str = _scalar(about="bundle_adjustment or closed_form")
+    method: str = _scalar(about="bundle_adjustment, maximum likelihood")
     source: str = _scalar(about="simulated or recorded")
     usable: bool = _scalar(about="whether the calibration is usable for control")
     reason: str = _scalar(about="reason why it is usable or not")

@@ -16,7 +16,6 @@ from projservo_cli.calibration.prediction import (
     joint_derivative,
     predict,
     prediction_variance,
-    require_covariance,
 )
 from projservo_cli.calibration.refit import refit, since_moved
 from projservo_cli.display import (
@@ -184,14 +183,12 @@ class ImageModel(Displayable, Calibration):
         Raises
         ------
         InputError
-            If the readings have another number of joints, are not finite or look like degrees, or deviations
-            are requested of a calibration without a covariance.
+            If the readings have another number of joints, are not finite or look like degrees.
         """
         rows, single = self._rows(q)
         pixels = predict(self, rows)
         if not return_std:
             return pixels[0] if single else pixels
-        require_covariance("return_std", self)
         sigma = np.sqrt(prediction_variance(self, rows))
         return (pixels[0], sigma[0]) if single else (pixels, sigma)
 
@@ -332,14 +329,7 @@ class ImageModel(Displayable, Calibration):
 
         Frame and scales, which no image shows, are fixed: of all errors that change images alike it has the
         smallest. For many markers it is large: (24 + 16 n + 4 m)² numbers.
-
-        Raises
-        ------
-        InputError
-            If the method has no covariance.
         """
-        if not self.has_covariance or not self.sqrt_cov_shared.size:
-            raise InputError(f"covariance: the method {self.method} has none; use bundle_adjustment")
         factor = error_factor(self)
         return np.asarray(factor @ factor.T)
 
@@ -365,10 +355,9 @@ class ImageModel(Displayable, Calibration):
         Raises
         ------
         InputError
-            If the joints determine no metric, the images of one camera are mirrored, the length is not known,
-            or the method has no covariance.
+            If the joints determine no metric, the images of one camera are mirrored, or the length is not
+            known.
         """
-        require_covariance("metric", self)
         return MetricModel.of(
             self,
             error_factor_with_model(self),

@@ -41,12 +41,12 @@ from projservo_cli.calibration.detections import (
     require_no_copies,
     require_size_and_noise,
 )
-from projservo_cli.calibration.epipolar import Epipolar, ImageFrame, ImageGeometry
+from projservo_cli.calibration.epipolar import ImageFrame, ImageGeometry
 from projservo_cli.calibration.initialization import Nominal, Progress, Search
 from projservo_cli.calibration.joint_model import AUTO, Hypothesis, fit_joint_model, hypotheses_of
 from projservo_cli.calibration.lens_estimation import fit_lens, share_explained, undistorted
 from projservo_cli.calibration.prediction import LENS, along_the_arm
-from projservo_cli.calibration.projective import Projective, closed_form_operators
+from projservo_cli.calibration.projective import Projective
 from projservo_cli.calibration.robust_fit import (
     MAX_PREDICTED,
     REFUSE_RATIO,
@@ -77,7 +77,7 @@ from projservo_cli.records import (
 )
 from projservo_cli.words import judged, with_findings
 
-_METHODS = ("bundle_adjustment", "closed_form")
+METHOD = "bundle_adjustment"
 # Fitted over expected noise above which a fit that passes may still have one joint at fault.
 _DOUBTFUL_RATIO = 2.0
 # Motion of images by the noise of joints over pixel noise, from which it may hide what is not as given.
@@ -106,7 +106,6 @@ def calibrate(
     observation: Observation,
     joint_types: str,
     *,
-    method: str = "bundle_adjustment",
     sigma_px: float | None = None,
     source: str = "simulated",
     image_size: ImageSize | None = None,
@@ -126,7 +125,6 @@ def calibrate(
     ----------
     observation : stereo images of the markers at a sequence of poses, raw px, NaN where unseen.
     joint_types : one letter a joint, R or P.
-    method : ``bundle_adjustment`` (maximum likelihood) or ``closed_form`` (eqs. 4, 5).
     sigma_px : noise per coordinate, px; None takes the median of the observation's ``sigma``,
         for a recording times the common factor that both views show, else estimates it from the epipolar
         geometry. The sigma of a detection sets its weight.
@@ -158,8 +156,6 @@ def calibrate(
     WorkFailed
         If the data do not support a calibration: which joint or marker, and why.
     """
-    if method not in _METHODS:
-        raise InputError(f"calibration method {method!r}: choose one of {', '.join(_METHODS)}")
     if source not in ("simulated", "recorded"):
         raise InputError(f"calibration source {source!r}: choose simulated or recorded")
     require_size_and_noise(image_size, sigma_px)
@@ -171,24 +167,10 @@ def calibrate(
         raise InputError(f"joint noise {joint_noise!r}: give a number that is not negative, or none")
     if mount not in (WORLD, TOOL):
         raise InputError(f"mount {mount!r}: choose {WORLD} or {TOOL}")
-    if mount == TOOL and (init is not None or method != "bundle_adjustment"):
-        raise InputError(
-            "cameras on the tool are calibrated by bundle_adjustment from images alone: leave out init"
-        )
-    if lens and method != "bundle_adjustment":
-        raise InputError(
-            f"calibration method {method!r} estimates no lens: choose bundle_adjustment, or calibrate without"
-        )
+    if mount == TOOL and init is not None:
+        raise InputError("cameras on the tool are calibrated from images alone: leave out init")
     curves = None if joint_model == AUTO else hypotheses_of(joint_model or (), joint_types, mount)
-    if (curves is None or curves) and method != "bundle_adjustment":
-        raise InputError(f"calibration method {method!r} fits no joint model: choose bundle_adjustment")
-    if method == "closed_form" and len(observation.view) != 2:
-        raise InputError(
-            f"calibration method closed_form takes two views, not {', '.join(observation.view)}: choose "
-            "bundle_adjustment"
-        )
     begin = time.perf_counter()
-    solution = None
     # The matrices are small: a second thread costs more than it gives.
     with threadpool_limits(limits=1):
         whole = Detections.of(observation, joint_types, mount)
@@ -212,27 +194,22 @@ def calibrate(
         if not lens:  # else after its estimation, since it bends the epipolar lines
             expected.require_scale(detections.view)
         require_images(whole, max(epipolar.sigma_px, expected.sigma_px))
-        if method == "closed_form":
-            assert isinstance(epipolar, Epipolar)
-            result = _closed_form(detections, epipolar, expected)
-        else:
-            problem = LeastSquares.of(detections, detections.reference())
-            search = Search(problem, epipolar, of_pair, rng, progress, joint_noise)
-            limit = MAX_PREDICTED * float(frame.size.max()) if max_predicted_px is None else max_predicted_px
-            asked = lens, init, curves
-            solution, expected, result = _maximum_likelihood(search, whole, frame, expect, asked, limit)
+        problem = LeastSquares.of(detections, detections.reference())
+        search = Search(problem, epipolar, of_pair, rng, progress, joint_noise)
+        limit = MAX_PREDICTED * float(frame.size.max()) if max_predicted_px is None else max_predicted_px
+        asked = lens, init, curves
+        solution, expected, result = _maximum_likelihood(search, whole, frame, expect, asked, limit)
         if of_still:
             standing_too = np.column_stack([numbers, np.full(len(numbers), WHY_LOST.index("still"))])
             known = standing_too[:0] if result.rejected_markers is None else result.rejected_markers
             lost = np.concatenate([known, standing_too])
             result = dataclasses.replace(with_findings(result, of_still), rejected_markers=lost)
         seconds = time.perf_counter() - begin
-        if solution is not None and fitted is not None:
+        if fitted is not None:
             fitted(solution, expected.noise_px(solution))
         if mount == TOOL:
             result = along_the_arm(result)
-        if method == "bundle_adjustment":
-            result = with_time_offset(result, observation)
+        result = with_time_offset(result, observation)
     return dataclasses.replace(result, source=source, seconds=seconds)
 
 
@@ -395,22 +372,11 @@ def _of_lens(calibration: Calibration, centered: bool) -> Iterator[Finding]:
         yield Finding("lens_off_center", LIMITS)
 
 
-def _closed_form(detections: Detections, epipolar: Epipolar, expected: Expected) -> Calibration:
-    """Record of the closed forms [RH00] eqs. (4), (5): all detections count, without covariance."""
-    result, q_reference, known = closed_form_operators(detections, epipolar.F, epipolar.sigma_px)
-    problem = LeastSquares.of(detections.of_markers(known), q_reference)
-    seen = problem.detections.seen
-    dof = 2 * int(np.count_nonzero(seen)) - problem.size
-    solution = Solution(problem, result.params, problem.residual(result.params), seen, dof)
-    found = Outliers.empty(problem.detections)
-    return _record(result, solution, expected, None, found, Finding("lagging_joints", LIMITS))
-
-
 def _record(
     result: Projective,
     solution: Solution,
     expected: Expected,
-    errors: Errors | None,
+    errors: Errors,
     found: Outliers,
     suspicion: Finding,
     *,
@@ -418,13 +384,12 @@ def _record(
 ) -> Calibration:
     """Record of a fit in its projective frame.
 
-    errors : of its parameters, None for a method without.
+    errors : of its parameters.
     found : explanations of rejected detections.
     suspicion : likely cause if residuals exceed pixel noise.
     limit_px : effect of deviations from the model above which the calibration is not usable.
     Raises WorkFailed if a joint is not determined.
     """
-    method = "closed_form" if errors is None else "bundle_adjustment"
     problem, detections, params = solution.problem, solution.problem.detections, result.params
     outlier = outlier_rows(detections, detections.seen & ~solution.used & ~found.explained)
     counts = len(found.suspect) + len(found.poses), len(found.id_switches)
@@ -432,22 +397,18 @@ def _record(
     check, (about, *rest) = verdict.check, verdict.findings
     of_images = *moved_images(detections, found.moved), *on_shown_poses(detections, found.shown)
     findings = (about, *rest, *of_images)
-    if errors is None:
-        m, unknown = len(params.M), np.full(params.P.size + params.H_hat.size, np.nan)
-        off = Errors(unknown[:, None], np.full((m, 4, 1), np.nan), np.full((m, 4, 3), np.nan))
-    else:
-        # Deviations hold on average over other poses, with the model's own error.
-        factor = 1.0
-        if check is not None and check.noise_px > 0.0:
-            factor = check.noise_factor * check.predicted_px / check.noise_px
-        off = result.errors(solution, errors).scaled(factor * expected.noise_px(solution))
+    # Deviations hold on average over other poses, with the model's own error.
+    factor = 1.0
+    if check is not None and check.noise_px > 0.0:
+        factor = check.noise_factor * check.predicted_px / check.noise_px
+    off = result.errors(solution, errors).scaled(factor * expected.noise_px(solution))
     operator_defect, trace_defect, plane_defect = result.defects()
     corner_squares, corner_q = solution.corners()
     used_rows, joint_noise = solution.used.any(axis=0), solution.joint_noise
     # Residuals beyond noise are an error of the model.
     over = solution.sigma_px**2 - expected.sigma_px**2 if expected.warns(solution) else 0.0
     return Calibration(
-        method=method,
+        method=METHOD,
         source="",
         view=detections.view,
         mount=detections.mount,
@@ -490,8 +451,8 @@ def _record(
         id_switches=np.concatenate(
             [detections.pose[found.id_switches[:, :1]], detections.marker[found.id_switches[:, 1:]]], axis=1
         ),
-        predicted_rms_px=None if verdict.error is None else verdict.error[0],
-        predicted_p99_px=None if verdict.error is None else verdict.error[1],
+        predicted_rms_px=verdict.error[0],
+        predicted_p99_px=verdict.error[1],
         lens=params.lens,
         sigma_view_px=_noise_of_views(solution),
         sigma_q=None if joint_noise is None else joint_noise.sigma_q,

@@ -345,12 +345,6 @@ def dense_pixel_changes(
     return apart(*pixel_changes(params, errors, q, images), np.arange(m)[:, None], m)
 
 
-def require_covariance(what: str, calibration: Calibration) -> None:
-    """Refuse a calibration that does not say how far it is off, with an InputError."""
-    if not calibration.has_covariance or not calibration.sqrt_cov_shared.size:
-        raise InputError(f"{what}: the method {calibration.method} has no covariance: use bundle_adjustment")
-
-
 def error_factor(calibration: Calibration) -> FloatArray:
     """Factor (12 V + 16 n + 4 m, r + 3 m) of the covariance of P, H_hat_0, lenses, M: for few markers.
 

@@ -126,11 +126,6 @@ class _Images:
 
     @classmethod
     def of(cls, c: Calibration, observation: Observation) -> "_Images":
-        if not c.has_covariance:
-            raise InputError(
-                f"the method {c.method} of the calibration states no covariance: calibrate by "
-                "bundle_adjustment"
-            )
         seen, numbers = observation.at_rest, c.marker.tolist()
         if seen.q.shape[1] != len(c.H_hat_0):
             raise InputError(f"readings of {seen.q.shape[1]} joints, and the arm has {len(c.H_hat_0)}")

@@ -357,11 +357,6 @@ def _asked(
 
     laws, records = _law_names(options.get("laws", ())), "record" in names
     config, stored = _resolve(options, recording=records)
-    if options.get("suggest") is not None and config.calibration.method != "bundle_adjustment":
-        raise click.UsageError(
-            f"--suggest: the method {config.calibration.method} has no covariance to judge poses by; "
-            "use --set calibration.method=bundle_adjustment"
-        )
     if wanted := _optional_files(options):
         _require_optional(config, wanted)
     if records and recording is None:

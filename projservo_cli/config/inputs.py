@@ -88,7 +88,6 @@ def calibration_inputs(config: Config, files: Files | None = None) -> Calibratio
         source = _trials(config, truth_of(config, face=False), files, speed_scale=1.0)
     noise = None if settings.joint_noise_deg is None else float(np.radians(settings.joint_noise_deg))
     how = Estimation(
-        settings.method,
         settings.lens,
         _file(config, "init", files),
         settings.cross_validate,
@@ -260,11 +259,13 @@ def _displacement(config: Config) -> StandOff | None:
     on = {config.features[pair[1]].on for pair in config.task.goal.incidences}
     if len(on) > 1:
         raise InputError(
-            f"displaced: the incidences of the goal are on {' and '.join(sorted(on))}, so teach "
+            f"task.goal.displaced: the incidences of the goal are on {' and '.join(sorted(on))}, so teach "
             "the approach as a goal of its own"
         )
     if config.mount == TOOL:
-        raise InputError("displaced: goals of cameras on the tool are not displaced: teach the other goal")
+        raise InputError(
+            "task.goal.displaced: goals of cameras on the tool are not displaced: teach the other goal"
+        )
     flat, of_start = config.features[along.along].flat(config.features), config.task.goal.of_start
     return StandOff(along.along, flat, along.by_m, along.by_px, of_start)
 
@@ -537,17 +538,15 @@ def _trials(
         raise InputError("trial motions need a reference: set calibration.reference or task.start")
     # The ideal plant stands wherever it is sent.
     driven = truth is None or plant.rendered is not None or config.disturbance.part(Faults) != Faults()
-    # The closed form assumes that joints without a command stand still.
-    faultless = not driven or settings.method == "closed_form"
     poses = settings.random_poses
     if poses is None:
-        poses = 0 if faultless else _RANDOM_POSES
+        poses = _RANDOM_POSES if driven else 0
     motions = Motions(
         reference,
         (math.radians(settings.amplitude_deg), settings.amplitude_m),
         settings.frames_per_joint,
         poses,
-        0.0 if faultless else 2.0 * math.pi / (config.disturbance.encoder_counts_per_turn or _TICKS),
+        2.0 * math.pi / (config.disturbance.encoder_counts_per_turn or _TICKS) if driven else 0.0,
         _seed(config),
     )
     return Trials(

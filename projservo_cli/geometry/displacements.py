@@ -19,6 +19,8 @@ from projservo_cli.records import BoolArray, FloatArray, WorkFailed
 _NOWHERE = np.eye(4)
 # Change of a quadratic form by the joints, over the largest, below which it is invariant.
 _INVARIANT = 1e-6
+# Sine of a trial's angle, or its length, from which on the displacement determines the operator.
+_LEAST_LEVER = 1e-3
 # Rotation vectors (24, 3) of the symmetries of a cube.
 _TURNS = Rotation.create_group("O").as_rotvec()
 # Orthonormal basis (6, 3, 3) of symmetric forms, by the rows and columns of their entries.
@@ -135,6 +137,18 @@ def normalize_displacement(H: FloatArray, A: FloatArray, a_inf: FloatArray) -> F
     if np.sum((A @ a_inf) * (A @ result.T @ a_inf)) < 0.0:
         result = -result
     return result
+
+
+def tangent_operator(H: FloatArray, amplitude: float, *, prismatic: bool) -> FloatArray:
+    """Operator (4, 4) of a joint that alone displaced by H (4, 4), [RH00] eqs. (4), (5), group to algebra.
+
+    amplitude : of its motion, rad, or for a prismatic joint in the unit of the operator.
+    Raises ValueError near 0 and near ±180° of a rotation, where the displacement leaves the operator open.
+    """
+    lever = amplitude if prismatic else math.sin(amplitude)
+    if abs(lever) < _LEAST_LEVER:
+        raise ValueError(f"a motion by {amplitude:.4g} leaves the operator open")
+    return np.asarray((H - np.linalg.inv(H)) / (2.0 * lever))
 
 
 def homogeneous(points: FloatArray) -> FloatArray:

@@ -32,7 +32,7 @@ def fault_at_rest(
     sigma_px : pixel noise per coordinate where that is more than the calibration's.
     fresh : (K, V) whether a view has a new frame in each; None all.
     """
-    if not calibration.usable or not calibration.has_covariance:
+    if not calibration.usable:
         return None
     shown = _of_known_markers(calibration, shown)
     sigma_px = max(calibration.sigma_px, calibration.sigma_fitted_px, sigma_px)

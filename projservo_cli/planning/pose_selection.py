@@ -15,7 +15,7 @@ from projservo_cli.calibration.prediction import (
 from projservo_cli.calibration.refit import errors_of_others, rows_of_camera
 from projservo_cli.image_size import image_corners, image_sizes
 from projservo_cli.planning.model_spread import Region, drawn_poses
-from projservo_cli.records import BoolArray, Calibration, FloatArray, InputError, Observation, WorkFailed
+from projservo_cli.records import BoolArray, Calibration, FloatArray, Observation, WorkFailed
 
 # The range of the recorded readings is widened at each end by this share of itself; for a robot
 # whose limits are known, the candidates' by more.
@@ -87,14 +87,8 @@ def suggest(
     targets : region of the poses that are to be predicted well.
     count : poses to suggest.
     rng : draws both.
-    Raises InputError if the method of the calibration has no covariance; WorkFailed if no pose of a region
-    shows the markers to both views.
+    Raises WorkFailed if no pose of a region shows the markers to both views.
     """
-    if not calibration.has_covariance:
-        raise InputError(
-            f"suggestions need a covariance, which the method {calibration.method} has not: "
-            "use --set calibration.method=bundle_adjustment"
-        )
     few = calibration.with_markers(even_choice(len(calibration.M), _MOST_SHOWN))
     sigma = max(calibration.sigma_px, calibration.sigma_fitted_px)
     _, T = _visible_poses(few, targets, _TARGETS, rng)

@@ -64,10 +64,7 @@ def _calibration_words(values: Mapping[str, Any], *, estimated: bool) -> Iterato
 def _worst_joint(values: Mapping[str, Any]) -> str:
     """Name the joint that adds most to predicted images, and whether it is well observable."""
     joints = values["joints"]
-    noises = [(joint["noise"], i) for i, joint in enumerate(joints) if math.isfinite(joint["noise"])]
-    if not noises:
-        return f"The method {values['method']} states no uncertainty, so no joint can be called the worst."
-    noise, worst = max(noises)
+    noise, worst = max((joint["noise"], i) for i, joint in enumerate(joints))
     reach = f"{REACH_M:g} m" if joints[worst]["type"] == "P" else f"{REACH_RAD:g} rad"
     return (
         f"Joint {worst + 1} is known worst: {reach} from the reference it adds {short(noise)} times the "

@@ -1,6 +1,5 @@
 """Trial motions, the table that stands in for them, and the method that evaluates them."""
 
-from collections.abc import Iterator
 from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, StrictBool, StrictInt, StringConstraints
@@ -9,7 +8,6 @@ from projservo_cli.deviations import CURVES
 from projservo_cli.settings.sections import (
     Count,
     JointVector,
-    Note,
     NotNegative,
     Number,
     Positive,
@@ -56,11 +54,10 @@ class Refit(Section):
 
 
 class CalibrationSettings(Section):
-    """Trial motions of one joint each around a reference, and the method that evaluates them."""
+    """Trial motions of one joint each around a reference, and how they are evaluated."""
 
-    method: Literal["bundle_adjustment", "closed_form"] = Field(
-        "bundle_adjustment",
-        description="bundle_adjustment is maximum likelihood; closed_form has the closed forms of the paper",
+    method: Literal["bundle_adjustment"] = Field(
+        "bundle_adjustment", description="maximum likelihood, the only one"
     )
     frames_per_joint: StrictInt = Field(
         8, ge=0, le=10_000, description="trial poses of each joint, in addition to the reference"
@@ -115,14 +112,6 @@ class CalibrationSettings(Section):
         (),
         description="cameras that moved since, each fitted again, in this order, as calibrate --refit does",
     )
-
-    def contradictions(self) -> Iterator[Note]:
-        """Yield keys of another method."""
-        if self.refits and self.method != "bundle_adjustment":
-            yield ("refits",), f"belong to the method bundle_adjustment, not to {self.method}"
-        for key in ("cross_validate", "init"):
-            if getattr(self, key) is not None and self.method != "bundle_adjustment":
-                yield (key,), f"belongs to the method bundle_adjustment, not to {self.method}"
 
 
 class Data(Section):

@@ -141,7 +141,6 @@ def estimate(
         return calibrate(
             observation,
             seen.joint_types,
-            method=asked.method,
             sigma_px=seen.noise_px,
             source="simulated" if seen.exact else "recorded",
             image_size=seen.image_size,

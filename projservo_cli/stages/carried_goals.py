@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from projservo_cli import words
-from projservo_cli.calibration.prediction import error_factor_with_model, require_covariance
+from projservo_cli.calibration.prediction import error_factor_with_model
 from projservo_cli.findings import REFUSES, Finding, Subject
 from projservo_cli.metric.frame import Metric, Scale
 from projservo_cli.records import Calibration, CarriedByObject, InputError, Plan, WorkFailed
@@ -34,7 +34,6 @@ def in_metres(calibration: Calibration, known: KnownLengths) -> tuple[Metric | N
         return None, f"no length on the tool is known: set {keys}"
     face = [number for number in known.face if number in calibration.marker]
     try:
-        require_covariance("metric", calibration)
         factor = error_factor_with_model(calibration)
         return Metric.of(calibration, factor, length_m=length_m, between=between, face=face or None), ""
     except (InputError, WorkFailed) as error:

@@ -171,7 +171,7 @@ def calibration_finding(
 
     lengths : (f, f) between the markers of the face, m, NaN if unknown; noise_px : of the images of a run.
     """
-    if not calibration.usable or not calibration.has_covariance:
+    if not calibration.usable:
         return Finding("unusable_calibration", LIMITS)
     size = image_sizes(image_size or at_rest.frame_sizes, calibration.view)
     marker = at_rest.shown.marker

@@ -124,7 +124,6 @@ class Table(NamedTuple):
 class Estimation:
     """Settings of the estimation of a calibration."""
 
-    method: str = "bundle_adjustment"  # or closed_form
     lens: bool = False  # whether to estimate radial distortion, two coefficients a camera, and its centre
     init: File | None = None  # JSON of a robot and rig that are tried first as a start
     cross_validate: int | None = None  # parts into which poses are divided to predict each from the others

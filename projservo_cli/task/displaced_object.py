@@ -18,7 +18,6 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
-from projservo_cli.calibration.prediction import require_covariance
 from projservo_cli.findings import REFUSES, Finding, Subject
 from projservo_cli.geometry.displacements import generators, homogeneous
 from projservo_cli.geometry.lens import undistort
@@ -377,14 +376,13 @@ class DisplacedObject:
         marker : (k,) numbers of the markers of the object, as messages name them.
         looks : two or more, the first when the goal was taught, the last now; views as of the calibration.
         metric : of the calibration with a known length, for mm.
-        Raises InputError for cameras on the tool or a calibration without a covariance, and WorkFailed for
-        what images or joints do not show, which names the freedom that is missing.
+        Raises InputError for cameras on the tool, and WorkFailed for what images or joints do not show, which
+        names the freedom that is missing.
         """
         if c.mount == TOOL:
             raise InputError(
                 "objects: cameras on the tool see the scene that the goal is on: its own images are the goal"
             )
-        require_covariance("objects", c)
         rig = LookRig.of(c)
         fit, known, left_out = _of_one_object(rig, marker, looks)
         numbers = tuple(np.asarray(marker)[known].tolist())

@@ -27,7 +27,7 @@ _CAUSES = (
 # Findings of which one line names all that are alike.
 _TOGETHER = ("placeholders", "hopeless_joint", "joint_together", "joint_in_few_poses", "little_motion")
 # Those that the reason of a calibration or its stated error says, and advice does not repeat.
-_OF_REASON = ("noise", "residuals", "closed_form", "joint_noise", "deviations", "unshown")
+_OF_REASON = ("noise", "residuals", "joint_noise", "deviations", "unshown")
 
 
 def limit(one: Finding, setup: Setup) -> str:
@@ -81,8 +81,6 @@ def reason(findings: Sequence[Finding], setup: Setup) -> str:
     """Return why a calibration is usable or not: its residuals, and what limits it."""
     about, *rest = findings
     text = sentence(about, setup)
-    if about.code == "closed_form":
-        return f"{text}: {Told([about], setup).text('remedy')}"
     if about.code == "told" and first(rest, REFUSES) is None:
         return text
     text += "".join(f", with {sentence(one, setup)}" for one in rest if one.code == "joint_noise")

@@ -80,12 +80,6 @@ CALIBRATION = {
         "{origin}",
         limit="more than pixel noise",
     ),
-    "closed_form": Row(
-        "the closed_form method explains the images only to {amount} a coordinate, {ratio} times the {limit} "
-        "{origin}",
-        "use bundle_adjustment",
-        limit="the method",
-    ),
     "joint_noise": Row("joint readings off by {amount} rms{ticks}", limit="noise"),
     "coarse_joints": Row(
         "errors of joint readings move images by {effect}, more than pixel noise",

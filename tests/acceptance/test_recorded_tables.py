@@ -1,4 +1,4 @@
-"""Recorded tables of two arms, through the command line: held-out prediction, noise, methods, order."""
+"""Recorded tables of two arms, through the command line: held-out prediction, noise, order."""
 
 import csv
 import json
@@ -6,7 +6,6 @@ import json
 import numpy as np
 import pytest
 
-from projservo_cli.store import run_file
 from projservo_cli.store.observation_tables import read_table
 
 JOINTS = {"ur5": "RRRRRR", "stanford": "RRPRRR"}
@@ -18,25 +17,24 @@ HELD_OUT = {
     ("stanford", "0.5"): (0.18, 0.5),
     ("stanford", "1.0"): (0.38, 1.2),
 }
-# Pixels of the tables are rounded to 1e-6: their own noise is 2.9e-7 px a coordinate. The closed
-# form passes it on enlarged (6e-6 px measured), far below the 1e-3 it must reach.
-NOISE_FREE = {"bundle_adjustment": 2e-6, "closed_form": 5e-5}
+# Pixels of the tables are rounded to 1e-6: their own noise is 2.9e-7 px a coordinate.
+NOISE_FREE_PX = 2e-6
 
 
 @pytest.fixture
 def held_out(answer, made_once, shared_data):
     """Calibrate from a table, predict the validation poses: folder of the run, both JSON objects."""
 
-    def run(robot, noise, method="bundle_adjustment"):
+    def run(robot, noise):
         def make(folder):
             words = ["calibrate", "--data", shared_data / robot / f"trials_{noise}px.csv"]
-            words += ["--joints", JOINTS[robot], "--set", f"calibration.method={method}", "-o", folder]
+            words += ["--joints", JOINTS[robot], "-o", folder]
             code, found, err = answer(*words)
             # A calibration that is not usable is a failure, and yet stored for comparison.
             assert code == (0 if found["usable"] else 1), err
             (folder / "told.json").write_text(json.dumps(found), encoding="utf-8")
 
-        folder = made_once(f"recorded {robot} {noise} {method}", make)
+        folder = made_once(f"recorded {robot} {noise}", make)
         code, value, err = answer("validate", folder, "--data", shared_data / robot / "validation.csv")
         assert code == 0, err
         assert value["count"] == 4000  # 200 poses, 10 markers, 2 views: nothing was dropped
@@ -63,16 +61,14 @@ def test_noisy_tables_predict_images_not_seen(held_out, robot, noise):
     assert [joint["type"] for joint in calibration["joints"]] == list(JOINTS[robot])
 
 
-@pytest.mark.parametrize("method", NOISE_FREE)
 @pytest.mark.parametrize("robot", JOINTS)
-def test_noise_free_tables_are_explained_to_their_rounding(held_out, robot, method):
-    folder, calibration, value = held_out(robot, "0.0", method)
-    assert value["rms_px"] <= NOISE_FREE[method]
-    assert value["p95_px"] <= 2.0 * NOISE_FREE[method]
+def test_noise_free_tables_are_explained_to_their_rounding(held_out, robot):
+    _, calibration, value = held_out(robot, "0.0")
+    assert value["rms_px"] <= NOISE_FREE_PX
+    assert value["p95_px"] <= 2.0 * NOISE_FREE_PX
     assert calibration["usable"]
     assert 0.001 < calibration["sigma_px"] < 0.01  # the floor of the estimate
-    assert calibration["rms_px"] <= NOISE_FREE[method]
-    assert run_file.load(folder).calibration.method == method
+    assert calibration["rms_px"] <= NOISE_FREE_PX
 
 
 def test_a_table_says_the_same_in_any_order(shared_data, rng, tmp_path):

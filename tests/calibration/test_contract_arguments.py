@@ -35,9 +35,7 @@ CASES = {
     "three views": (shaped(images=OBSERVATION.images[:, [0, 1, 1]]), "RPR", {}, "2 views"),
     "no image": (OBSERVATION, "RPR", {"image_size": (1280, 0)}, "positive width"),
     "negative seed": (OBSERVATION, "RPR", {"seed": -1}, "seed -1"),
-    "method": (OBSERVATION, "RPR", {"method": "best"}, "bundle_adjustment, closed_form"),
     "source": (OBSERVATION, "RPR", {"source": "dreamt"}, "simulated or recorded"),
-    "lens of closed forms": (OBSERVATION, "RPR", {"method": "closed_form", "lens": True}, "no lens"),
     "another letter": (OBSERVATION, "RXR", {}, "R or P"),
     "joint reading not a number": (spoilt("q", np.nan), "RPR", {}, "joint readings"),
     "infinite pixel": (spoilt("images", np.inf), "RPR", {}, "pixels"),
@@ -88,7 +86,6 @@ def test_arguments_are_left_as_they_were():
     before = {name: value.copy() for name, value in arrays.items()}
     for name in before:
         getattr(OBSERVATION, name).setflags(write=False)
-    for method in ("bundle_adjustment", "closed_form"):
-        calibrate(OBSERVATION, "RPR", method=method, source="recorded")
+    calibrate(OBSERVATION, "RPR", source="recorded")
     for name, value in before.items():
         np.testing.assert_array_equal(getattr(OBSERVATION, name), value)

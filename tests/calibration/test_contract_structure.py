@@ -108,19 +108,3 @@ def test_a_point_behind_a_camera_has_no_image(case):
     assert np.isnan(other[:, 1]).all()
     assert np.isfinite(one).all()
     assert robot.projected(q)[:, :, 2].min() > 0.0
-
-
-def test_the_closed_form_finds_the_same_operators_without_noise():
-    rng = np.random.default_rng(3)
-    robot = random_robot("RRPRRR", rng)
-    observation = robot.observe(trials(robot), 0.0, rng)
-    q = around(robot, 30, rng)
-    calibration = calibrate(observation, robot.joint_types, method="closed_form", source="recorded")
-    # Round-off of double precision alone: 1e-12 px measured.
-    assert np.abs(predict(calibration, q) - robot.images(q)).max() <= 1e-8
-    assert calibration.operator_defect.max() <= 1e-9
-    assert calibration.plane_defect.max() <= 1e-9
-    np.testing.assert_allclose(calibration.M @ calibration.a_inf, 1.0, rtol=1e-9)
-    # It claims no certainty that it has not computed.
-    assert not calibration.has_covariance
-    assert np.isnan(calibration.prediction_noise).all()

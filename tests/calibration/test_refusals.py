@@ -14,7 +14,6 @@ from tests.studies.combined_mistakes import ENDS, ending
 
 SIGMA = 0.5
 TYPES = "RRRRRR"
-METHODS = ("bundle_adjustment", "closed_form")
 ROBOT = random_robot(TYPES, np.random.default_rng(1), markers=6)
 SMALL = random_robot("RRR", np.random.default_rng(1), markers=6)
 Q = trials(ROBOT, 4)
@@ -79,15 +78,14 @@ def test_as_few_numbers_as_the_joints_have_are_refused(types, count, enough):
     calibrate(seen(robot, q[1]), types, source="recorded")
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_a_joint_without_trials_is_named(method):
+def test_a_joint_without_trials_is_named():
     moved = np.abs(Q - Q[0]) > 1e-9
     for joint in (0, 5):
-        message = refusal(some(poses=~moved[:, joint]), method=method)
+        message = refusal(some(poses=~moved[:, joint]))
         assert f"joint {joint + 1} has no trial motion" in message
     # … nor one whose trials no camera saw.
     images = np.where(moved[:, 3, None, None, None], np.nan, IMAGES)
-    assert "joint 4 has no trial motion" in refusal(changed(seen(), images=images), method=method)
+    assert "joint 4 has no trial motion" in refusal(changed(seen(), images=images))
 
 
 @pytest.mark.parametrize(
@@ -153,16 +151,14 @@ def test_markers_on_a_line_are_seen_through_wrong_detections(sigma, wrong):
     observation = seen(changed(ROBOT, markers=np.c_[points, np.ones(8)]), trials(ROBOT), sigma)
     images = observation.images.copy()
     images[np.random.default_rng(5).random(images.shape[:3]) < wrong] += 40.0
-    for method in METHODS:
-        assert "the markers lie on one line" in refusal(changed(observation, images=images), method=method)
+    assert "the markers lie on one line" in refusal(changed(observation, images=images))
 
 
-@pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("sigma", [0.0, SIGMA])
-def test_a_joint_that_reads_but_stands_still_is_named(method, sigma):
+def test_a_joint_that_reads_but_stands_still_is_named(sigma):
     still = Q.copy()
     still[:, 3] = Q[0, 3]
-    message = refusal(changed(seen(q=still, sigma=sigma), q=Q), method=method)
+    message = refusal(changed(seen(q=still, sigma=sigma), q=Q))
     assert "joint 4 stands still" in message
     assert "60°" in message
 

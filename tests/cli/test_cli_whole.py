@@ -25,11 +25,7 @@ def elsewhere(monkeypatch, tmp_path):
     [
         (["--cross-validate", "1"], "--cross-validate 1: calibration.cross_validate"),
         (["--cross-validate", "26"], "there are 25 poses; choose 2 to 25 parts"),
-        (
-            ["--cross-validate", "3", "--set", "calibration.method=closed_form"],
-            "the method bundle_adjustment",
-        ),
-        (["--suggest", "--set", "calibration.method=closed_form"], "no covariance to judge poses by"),
+        (["--set", "calibration.method=closed_form"], "calibration.method"),
         (["--init", "none.json"], "none.json: cannot be read"),
         (["--init", "bad.json"], "bad.json:1:1: not JSON"),
     ],

@@ -19,6 +19,7 @@ from projservo_cli.geometry.displacements import (
     rotation_and_inverse,
     screw_displacements,
     screws,
+    tangent_operator,
     translation,
     twists,
 )
@@ -93,6 +94,21 @@ def test_scale_of_a_homography_keeps_points_on_their_side_of_infinity():
             result = normalize_displacement(k * H, M, a_inf)
             assert result == pytest.approx(H, abs=1e-12)
             assert np.linalg.det(result) == pytest.approx(1.0, abs=1e-12)
+
+
+def test_operators_of_trial_motions_are_those_of_the_joints():
+    """In any projective frame and by homographies of any scale, [RH00] eqs. (2), (4), (5)."""
+    a_inf = np.array([0, 0, 0, 1.0]) @ np.linalg.inv(frame(3))
+    A = np.random.default_rng(2).uniform(-1.0, 1.0, (5, 4))
+    points = A / (A @ a_inf)[:, None]
+    turns, slides = conjugate(revolute([0.3, -0.2, 1.5], [1, 2, -3]), 3), conjugate(prismatic([1, 2, -3]), 3)
+    for H_hat, amplitude, of_slide in ((turns, 0.7, False), (turns, -2.9, False), (slides, 0.2, True)):
+        H = normalize_displacement(-2.3 * expm(amplitude * H_hat), points, a_inf)
+        found = tangent_operator(H, amplitude, prismatic=of_slide)
+        np.testing.assert_allclose(found, H_hat, atol=1e-11 * np.linalg.norm(H_hat))
+    for amplitude, of_slide in ((0.0, False), (math.pi, False), (0.0, True)):
+        with pytest.raises(ValueError, match="open"):
+            tangent_operator(np.eye(4), amplitude, prismatic=of_slide)
 
 
 def test_a_homography_that_reflects_or_is_singular_is_refused():

@@ -203,15 +203,15 @@ class _Assessment:
 
     span: FloatArray  # (n,) range in the data, rad or m
     noise: FloatArray  # (n,) noise of images at the reach, in units of the pixel noise; NaN if unknown
-    # expected error of images at random poses and its 99th percentile, px; None if unknown
-    error: tuple[float, float] | None
+    # expected error of images at random poses and its 99th percentile, px
+    error: tuple[float, float]
     check: ModelCheck | None  # deviations from the model; None if it is exact, as in a simulation
     findings: tuple[Finding, ...]  # its residuals first, then what limits it, the most important first
 
 
 def assess(
     solution: Solution,
-    errors: Errors | None,
+    errors: Errors,
     expected: Expected,
     outlier: IntArray,
     rejected: tuple[int, int],
@@ -220,22 +220,17 @@ def assess(
 ) -> _Assessment:
     """Assess a fit.
 
-    errors : of its parameters; None for the closed form, which has none.
+    errors : of its parameters.
     outlier : (L, 3) rejected observations: pose, marker, index of the view (their number for all).
     rejected : numbers of suspect joint readings and of exchanged marker numbers.
     suspicion : likely cause if residuals exceed pixel noise.
     max_predicted_px : effect of deviations from the model on predictions above which it is not usable.
     Raises WorkFailed naming a joint that moves no image, or whose operator is not determined.
     """
-    # Residuals of a method without covariance are its own errors, not noise of the images.
-    sigma = expected.sigma_px if errors is None else expected.noise_px(solution)
+    sigma = expected.noise_px(solution)
     span = _require_joints_seen(solution, sigma)
     warned = expected.warns(solution)
     code, severity = ("residuals", LIMITS) if warned else ("noise", NOTE)
-    if errors is None:
-        code, severity = ("closed_form", REFUSES) if warned else (code, severity)
-        unknown = np.full(len(span), np.nan)
-        return _Assessment(span, unknown, None, None, (expected.finding(code, severity, solution),))
     noise, error, weak = _noise_of_joints(solution, errors, sigma)
     check = None
     if not expected.known:

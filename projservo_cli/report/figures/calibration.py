@@ -175,10 +175,8 @@ def _information(calibration: Calibration) -> FloatArray:
     """Eigenvalues of the information matrix, falling: the covariance's that are not zero, inverted.
 
     Zero are the gauge directions, and those across the constraint that all operators are conjugate
-    to rigid motions by one matrix. Of P, H_hat_0 and M, some of them for many; empty without a covariance.
+    to rigid motions by one matrix. Of P, H_hat_0 and M, some of them for many.
     """
-    if not calibration.has_covariance:
-        return np.zeros(0)
     few = calibration.with_markers(even_choice(len(calibration.M), MAX_JUDGED))
     spread = np.linalg.svd(error_factor(few), compute_uv=False)[::-1] ** 2
     floor = len(spread) * np.finfo(np.float64).eps * spread[-1]
@@ -268,9 +266,6 @@ def _poses(axes: "style.Axes", data: Data) -> None:
         xlabel="predicted error with noise (px)" if held_out else "predicted error (px)",
         ylabel="rms residual (px)",
     )
-    if not np.isfinite(predicted).all():
-        _without_covariance(axes)
-        return
     upper = 1.06 * float(predicted.max(initial=0.0))
     x = np.linspace(0.94 * float(predicted.min(initial=upper)) if held_out else 0.0, upper, 101)
     expected = x if held_out else _expected_residual(x, sigma)
@@ -308,15 +303,6 @@ def _spectrum(axes: "style.Axes", data: Data) -> None:
     values = data["information"]
     title = f"information, {len(values)} directions of {int(data['parameters'])} numbers"
     axes.set(title=title, xlabel="direction (best to worst)", ylabel="eigenvalue (1)")
-    if values.size:
-        line = style.line(style.BLUE, width=0.8, marker="o", markersize=2.5)
-        axes.plot(np.arange(1, len(values) + 1), values, **line)
-        style.log_scale(axes)
-    else:
-        _without_covariance(axes)
-
-
-def _without_covariance(axes: "style.Axes") -> None:
-    """Say why a panel is empty."""
-    axes.set(xticks=[], yticks=[])
-    axes.text(0.5, 0.5, "the method has no covariance", ha="center", va="center", transform=axes.transAxes)
+    line = style.line(style.BLUE, width=0.8, marker="o", markersize=2.5)
+    axes.plot(np.arange(1, len(values) + 1), values, **line)
+    style.log_scale(axes)
