@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from projservo_cli import plugins
-from projservo_cli.chain import compilation, require_simulated
+from projservo_cli.chain.making import require_simulated
 from projservo_cli.config import Config, Override, load_config, overrides_of, sweep_of, to_yaml
 from projservo_cli.config.inputs import (
     calibration_inputs,
@@ -27,6 +27,7 @@ from projservo_cli.display import checked_array, numbers_in, require_radians
 from projservo_cli.experiment import Experiment, law_target, plan_scene_of
 from projservo_cli.files import working_in, writing
 from projservo_cli.laws import CODES, REGULATE, law_and_mode, run_name, run_names
+from projservo_cli.loop.compilation import compilation
 from projservo_cli.observations import Observations, require_observations
 from projservo_cli.progress import Listener
 from projservo_cli.records import Calibration, FloatArray, InputError, JointList, Plan

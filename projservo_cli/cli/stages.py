@@ -15,7 +15,7 @@ from projservo_cli.cli.program import FAILED, main
 from projservo_cli.deviations import CURVES
 
 if TYPE_CHECKING:
-    from projservo_cli.chain import Chain
+    from projservo_cli.chain.making import Chain
     from projservo_cli.config import Config
     from projservo_cli.records import WorkFailed
     from projservo_cli.store.run_file import Run
@@ -132,7 +132,7 @@ def _record(stages: Sequence[str], /, console: Console, **options: Any) -> int:
         raise click.UsageError("--joint-unit is that of --motions, which is not given")
     if len(stages) > 1:
         return _make(console, stages, options)
-    from projservo_cli.chain import data_table, recording_made
+    from projservo_cli.chain.recordings import data_table, recording_made
     from projservo_cli.config.inputs import recording_inputs
     from projservo_cli.files import writing
     from projservo_cli.stages.record import new_recording
@@ -317,7 +317,7 @@ def _make(console: Console, names: Sequence[str], options: Mapping[str, Any]) ->
     """Make the named stages and their missing inputs; return the exit code."""
     if options["threads"] is not None:  # read by the compiler's runtime when it is first imported
         os.environ["NUMBA_NUM_THREADS"] = str(options["threads"])
-    from projservo_cli.chain import FIGURES
+    from projservo_cli.chain.making import FIGURES
     from projservo_cli.files import tidy, working_in, writing
 
     chain = _asked(console, names, options)
@@ -352,7 +352,8 @@ def _asked(
 
     recording : where it was made just now.
     """
-    from projservo_cli.chain import Chain, pending_recording
+    from projservo_cli.chain.making import Chain
+    from projservo_cli.chain.recordings import pending_recording
     from projservo_cli.config import Override
 
     laws, records = _law_names(options.get("laws", ())), "record" in names

@@ -18,6 +18,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from projservo_cli import provenance
+from projservo_cli.chain.outdated import inputs_of, result_of, steps_for
 from projservo_cli.config import Config, stored_yaml
 from projservo_cli.config.inputs import servo_inputs
 from projservo_cli.files import write_whole
@@ -26,7 +27,6 @@ from projservo_cli.laws import codes_of
 from projservo_cli.loop.batch import until_rehearsal
 from projservo_cli.loop.compiled import run_compiled
 from projservo_cli.loop.jit_warmup import are_cached
-from projservo_cli.outdated import inputs_of, result_of, steps_for
 from projservo_cli.records import Calibration, CrossValidation, InputError, Observation, WorkFailed
 from projservo_cli.stages import Progress, calibrate
 from projservo_cli.store.run_file import Result, Run, load, save

@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from projservo_cli import cli, outdated
+from projservo_cli import cli
 from projservo_cli.calibration.checks import validation
+from projservo_cli.chain import outdated
 from projservo_cli.laws import law_and_mode
 from projservo_cli.records import Calibration, Observation, Plan, Report, Trace, WorkFailed
 from projservo_cli.stages import calibrate, plan, report, servo, validate

@@ -5,8 +5,8 @@ import numpy as np
 
 from projservo_cli.calibration import predict
 from projservo_cli.calibration.prediction import parameters_from
+from projservo_cli.chain.outdated import steps_for
 from projservo_cli.config import load_config, to_yaml
-from projservo_cli.outdated import steps_for
 from projservo_cli.records import Observation
 from projservo_cli.report.report_data import Fit
 from projservo_cli.robots.frame_recorder import FrameRecorder

@@ -1,7 +1,6 @@
 """A chain of stages: their order and permission, results made and saved, and findings of a call."""
 
-import os
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import KW_ONLY, InitVar, dataclass, field, replace
 from pathlib import Path
@@ -10,30 +9,28 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from projservo_cli import plugins
+from projservo_cli.chain.outdated import STAGES, Step, inputs_of, key_of_calibration, result_of, steps_for
+from projservo_cli.chain.recordings import recording_made
+from projservo_cli.chain.sequences import Steps
 from projservo_cli.config import Config, load_config, stored_yaml
 from projservo_cli.config.inputs import (
     about_of,
-    joints_of,
-    recording_inputs,
     scenery_of,
-    servo_inputs,
     suggestion_inputs,
 )
 from projservo_cli.findings import Finding
-from projservo_cli.geometry.jit import CACHE_FOLDER
 from projservo_cli.laws import CODES, POINT_LAWS, codes_of, law_and_mode, must_converge, run_name
-from projservo_cli.outdated import STAGES, Step, inputs_of, key_of_calibration, result_of, steps_for
+from projservo_cli.loop.compilation import compilation
 from projservo_cli.progress import Listener
-from projservo_cli.records import Action, FloatArray, InputError, JointList, Plan, WorkFailed
+from projservo_cli.records import InputError, Plan, WorkFailed
 from projservo_cli.result_hashes import digest
-from projservo_cli.settings.task import TaskStep
-from projservo_cli.stages.stage_inputs import CarryingObject, PlanInputs, ServoInputs
+from projservo_cli.stages.stage_inputs import CarryingObject, PlanInputs
 from projservo_cli.store.run_file import SERVO, Run, save
-from projservo_cli.words import failed, line, lines
+from projservo_cli.words import failed, line
 from projservo_cli.words.reasons import arrived, meaning
 
 if TYPE_CHECKING:
-    from projservo_cli.robots.session import Session
+    pass
 
 FIGURES = "figures"  # folder of a run in which a killed report may have left something
 
@@ -60,18 +57,19 @@ class Chain:
     confirm: bool = False  # whether to ask before the first motion
     in_memory: bool = False  # whether results stay in memory
     blind: bool = False  # whether a robot may move although cameras show nothing
-    session: "Session | None" = None  # connection to the robot that the steps of the task share
     steps: list[Step] = field(init=False)
     laws: tuple[str, ...] = field(init=False)  # names of the runs of laws that the steps make or need
     failed: str = ""  # name of the step that failed
     reason: str = ""  # why
     evidence: tuple[Finding, ...] = ()  # likewise, as data
     laws_done: tuple[str, ...] = ()
+    robot: Steps = field(init=False)  # on which steps of the task are made
 
     def __post_init__(self, wanted: Sequence[str], force: bool) -> None:
         stages = [name for name in self.names if name != "record"]
         why = "" if self.recording is None else self.recording.why
         given, self.config = self.config, _with_refits(self.config, self.run)
+        self.robot = Steps(self.config)
         self.steps = steps_for(self.config, self.run, stages, laws=wanted, force=force, recording=why)
         if self.config is not given:
             note = "the configuration names no calibration.refits, and those of the run stand"
@@ -157,7 +155,7 @@ class Chain:
             self.listener.say(notice)  # the first run on a machine is slower by that
         steps = [step for step in self.steps if step.stage != "record"]
         try:
-            with self._compiling(), self._connection():
+            with self._compiling(), self.robot.connection():
                 self._make_steps(steps)
         except WorkFailed as error:  # of a robot that may not be at rest
             self._fail(steps[-1], error)
@@ -175,14 +173,14 @@ class Chain:
             if step is motion and not self._may_move(step, steps):
                 return
             if step is motion and step.part and not self.config.plant.simulated:
-                self._opened(servo_inputs(self.config))  # which refuses what could not act later
+                self.robot.opened(self.run.calibration)
             try:
                 if step.why:
                     self._make_result(step)
             except (KeyboardInterrupt, InputError) as error:
                 if step.part and step.stage == "servo":
                     what = "refused" if isinstance(error, InputError) else "interrupted"
-                    self.listener.say(f"{step.name}: {what}{self._left_behind(step)}")
+                    self.listener.say(f"{step.name}: {what}{self.robot.left_behind(step.part)}")
                 raise
             if step.law and not self.failed:
                 name = step.name.removeprefix(SERVO)
@@ -192,7 +190,7 @@ class Chain:
                     self._fail(step, trace.reason)
                 elif not arrived(trace.verdict) and step.part:  # nor are the next steps made
                     self._fail(step, f"ended in {trace.verdict}: {trace.reason}")
-                elif self.session is not None and (lost := self.session.lost):
+                elif self.robot.session is not None and (lost := self.robot.session.lost):
                     self._fail(step, failed([lost]))
             if self.failed:
                 return
@@ -234,29 +232,9 @@ class Chain:
 
     def _fail(self, step: Step, why: str | WorkFailed) -> None:
         """Note the failure of a step, of a sequence with what stays as it was sent."""
-        after = self._left_behind(step) if step.part and step.stage == "servo" else ""
+        after = self.robot.left_behind(step.part) if step.part and step.stage == "servo" else ""
         self.failed, self.reason = step.name, " ".join(str(why).split()) + after
         self.evidence = why.findings if isinstance(why, WorkFailed) else ()
-
-    def _left_behind(self, step: Step) -> str:
-        """Say what stays as it was sent, and which steps of the sequence were not begun."""
-        names = list(self.config.steps)
-        rest = names[names.index(step.part) + 1 :]
-        kept = "" if self.session is None else ", ".join(lines(self.session.kept))
-        begun = f"{', '.join(rest)} {'was' if len(rest) == 1 else 'were'} not begun" if rest else ""
-        return "".join(
-            f"; {text}" for text in (kept, begun, "the sequence begins again at its first step") if text
-        )
-
-    def _connection(self) -> "AbstractContextManager[Any]":
-        """Return the connection that steps share, or that says where the arm stands; else nothing."""
-        task = self.config.task
-        if task is None or (not task.steps and task.start_joints is not None):
-            return nullcontext()
-        from projservo_cli.robots.session import Session
-
-        self.session = Session()
-        return self.session
 
     def reported(self, run: Run | None = None) -> Run:
         """Return the results that a report of the named runs of laws needs.
@@ -421,7 +399,7 @@ class Chain:
     def _made(self, step: Step, run: Run) -> tuple[Any, ...]:
         """Return the result of a stage from its inputs; import its module on demand."""
         if step.part and step.stage == "servo" and not step.law:
-            return (self._acted(self.config.steps[step.part]),)
+            return (self.robot.acted(self.config.steps[step.part], self.run.calibration),)
         config, progress = self.config.at_step(step.part), self.listener.progress
         inputs = step.record or inputs_of(step.stage, config)
         if step.stage == "calibrate":
@@ -436,98 +414,28 @@ class Chain:
         if step.stage == "plan":
             from projservo_cli.stages import plan
 
-            bounded = replace(_bounded(inputs, run), q_current=self._expected(step, run))
-            return (plan.run(bounded, run.calibration, session=self.session),)
+            bounded = replace(_bounded(inputs, run), q_current=self.robot.expected(step.part, run))
+            return (plan.run(bounded, run.calibration, session=self.robot.session),)
         if step.stage == "servo":
             from projservo_cli.stages import servo
 
             followed = (run.at_step(step.part) if step.part else run).plan
             given = replace(inputs, plan=_bounded(inputs.plan, run))
             if step.part and config.task is not None and config.task.start_joints is None:
-                given, followed = self._from_here(step, given, followed)
-            brought = {"blind": self.blind, "session": self.session}
+                given, followed = self.robot.from_here(step, run, given, followed)
+                self._follow(f"plan/{step.part}", followed)
+            brought = {"blind": self.blind, "session": self.robot.session}
             return (servo.run(given, run.calibration, followed, step.law, **brought),)
         from projservo_cli.stages import report
 
         return (report.run(inputs, self.reported(run), run.path.parent, progress=progress),)
 
-    def _acted(self, asked: TaskStep) -> Action:
-        """Have the robot act or wait."""
-        assert self.session is not None
-        if not self.config.plant.simulated:
-            self._opened(servo_inputs(self.config))
-        if asked.act is None:
-            assert asked.wait_s is not None
-            self.session.hold(asked.wait_s)
-            return Action("wait", f"{asked.wait_s:g} s", asked.wait_s)
-        seconds = sum(self.session.act(name, value) for name, value in asked.act.items())
-        said = ", ".join(f"{name} {value:g}" for name, value in asked.act.items())
-        nothing = any(map(self.session.empty, asked.act))
-        return Action("act", said + ", which holds nothing" * nothing, seconds)
-
-    def _opened(self, inputs: ServoInputs) -> FloatArray:
-        """Open the robot of somebody's, unless it is, and return where it stands (n,), rad or m."""
-        from projservo_cli.stages.external_robot import opened_robot
-        from projservo_cli.stages.worlds.calibrated import observed_numbers
-
-        c = self.run.calibration
-        assert self.session is not None
-        assert inputs.contract is not None
-        joints = inputs.plan.joints.joints(c.joint_types, c)
-        opened_robot(self.session, inputs.contract.driven, joints, observed_numbers(inputs.plan, c), c.view)
-        actions = {name for step in self.config.steps.values() for name in step.act or ()}
-        self.session.require_acts(actions)
-        return self.session.reading()
-
-    def _expected(self, step: Step, run: Run) -> FloatArray | None:
-        """Return where the arm will stand before a step, by the plan before; None for a given start."""
-        task = self.config.task
-        if task is None:
-            return None
-        before = self._motions
-        k = before.index(step.part) if step.part else 0
-        if k == 0:
-            return None if task.start_joints is not None else self._standing()
-        plan = run.at_step(before[k - 1]).plan
-        if not np.isfinite(plan.q[-1]).all():
-            raise WorkFailed(
-                f"where the arm then stands is open, since no joints follow the plan of {before[k - 1]}"
-            )
-        end: FloatArray = plan.q[-1]
-        return end
-
-    @property
-    def _motions(self) -> list[str]:
-        """Names of the steps of a sequence that move the arm."""
-        return [name for name, step in self.config.steps.items() if step.moves]
-
-    def _standing(self) -> FloatArray:
-        """Joints (n,) where the arm stands before anything moves it, rad or m."""
-        if not self.config.plant.simulated:
-            return self._opened(servo_inputs(self.config))
-        if self.config.calibration.reference is None:
-            raise InputError(
-                "task.start: current: a simulated robot stands at calibration.reference: set it, or joints"
-            )
-        return self.config.calibration.reference.values(self.config.joint_types or "")
-
-    def _from_here(self, step: Step, inputs: ServoInputs, plan: Plan) -> tuple[ServoInputs, Plan]:
-        """Return the inputs of a step from where the arm stands, and a plan from there, which is kept."""
-        from projservo_cli.stages import plan as planning
-
-        motions = self._motions
-        k, q = motions.index(step.part), plan.q_start
-        if k and self.session is not None and self.session.robot is not None:
-            q = self.session.reading()
-        elif k:
-            q = self.run.traces[f"{motions[k - 1]}/{step.law}"].q[-1]
-        inputs = replace(inputs, plan=replace(inputs.plan, q_current=q))
-        if (q != plan.q_start).any():
-            plan = planning.run(inputs.plan, self.run.calibration, plan)
-            name = f"plan/{step.part}"
-            found = replace(self.run.results[name], records={"": plan})
-            self.run = replace(self.run, results={**self.run.results, name: found})
-        return inputs, plan
+    def _follow(self, name: str, plan: Plan) -> None:
+        """Take a plan from where the arm stands in place of that of a name, unless it is that."""
+        stored = self.run.results[name]
+        if plan is not stored.records[""]:
+            taken = replace(stored, records={"": plan})
+            self.run = replace(self.run, results={**self.run.results, name: taken})
 
     def _compiling(self) -> AbstractContextManager[None]:
         """Return the background compilation for runs that follow a calibration."""
@@ -557,60 +465,6 @@ def _drives(step: Step) -> bool:
     return step.stage == "record" or (step.record is not None and step.record.carrier is not None)
 
 
-def data_table(config: Config) -> Path:
-    """Return the table of a configuration as one to be recorded; an InputError without."""
-    if config.data is None:
-        raise InputError("record needs a table to write: -o TABLE, or data.table in the configuration")
-    if config.data.joint_unit == "deg":
-        raise InputError("data.joint_unit: record writes rad; leave it out")
-    return Path(config.data.table)
-
-
-def pending_recording(config: Config, run: Run, motions: JointList | None, *, force: bool) -> Any:
-    """Return the pending recording of the table of a calibration.
-
-    motions : further poses after the trial motions.
-    """
-    from projservo_cli.stages.record import new_recording
-
-    path, stored, inputs = data_table(config), run.results.get("calibrate"), recording_inputs(config)
-    before = {} if stored is None else stored.inputs
-    if before.get("table", str(path)) != str(path) and config.plant.simulated and not force:
-        raise InputError(
-            f"{run.path}: its calibration comes from {before['table']} and would be replaced by a simulated "
-            "one; choose another folder, or use --force (force=True)"
-        )
-    found = new_recording(inputs, path, motions=motions, force=force, redo=True)
-    contradicted = run.refuted and not found.why
-    if not contradicted or before.get("table_sha256") != digest(path.read_bytes()):
-        return found
-    begun = new_recording(inputs, path, motions=motions, force=True)
-    return replace(begun, why=f"what is there was contradicted: {run.refuted}")
-
-
-def recording_made(listener: Listener, config: Config, recording: Any, *, confirm: bool) -> WorkFailed | None:
-    """Record the pending poses, and tell how far it is on an interrupt; return a failure."""
-    from projservo_cli.stages.record import record_poses
-
-    if recording.pending and confirm:
-        listener.confirm("record", config.plant)
-    total, units = len(recording.targets), joints_of(config).joints().units
-
-    def progress(what: str, done: int, whole: int) -> None:
-        listener.progress(what, done, whole, recording.note(units))
-
-    if recording.found and recording.pending:
-        listener.say(f"{recording.path}: continued after {recording.found} of {total} poses")
-    try:
-        record_poses(recording_inputs(config), recording, progress=progress)
-    except WorkFailed as error:
-        return WorkFailed(" ".join(error.reason.split()), findings=error.findings)
-    except KeyboardInterrupt:
-        listener.say(f"{recording.path}: {len(recording.done)} of {total} poses; run again to continue")
-        raise
-    return None
-
-
 def require_simulated(config: Config) -> None:
     """Refuse to simulate the trials of a robot that is not a simulated one, with an InputError."""
     if not config.recorded and not config.plant.simulated:
@@ -618,23 +472,6 @@ def require_simulated(config: Config) -> None:
             f"plant {config.plant.use} is calibrated from a table: record it, projservo record calibrate, or "
             "name one: data.table, --data"
         )
-
-
-def compilation(names: Iterable[str] = ()) -> str:
-    """Whether kernels will have to be compiled, in words; empty where they are there or are not used.
-
-    names : of the runs of laws that will be made.
-    """
-    if os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0"):
-        return ""
-    if CACHE_FOLDER is None:
-        return "compiling kernels (in every run: no cache folder can be written)"
-    found = any(CACHE_FOLDER.rglob("*.nbi"))
-    if found and (codes := codes_of(names)):
-        from projservo_cli.loop.jit_warmup import are_cached
-
-        found = are_cached(codes)
-    return "" if found else "compiling kernels, once"
 
 
 def _bounded(inputs: PlanInputs, run: Run) -> PlanInputs:

@@ -1,0 +1,1 @@
+"""Stages in their order: what is outdated, made, kept and dropped."""

@@ -1,0 +1,119 @@
+"""Steps of a task on a robot: where the arm stands before each, what it is told, and what is left behind."""
+
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from projservo_cli.chain.outdated import Step
+from projservo_cli.config import Config
+from projservo_cli.config.inputs import servo_inputs
+from projservo_cli.records import Action, Calibration, FloatArray, InputError, Plan, WorkFailed
+from projservo_cli.settings.task import TaskStep
+from projservo_cli.stages.stage_inputs import ServoInputs
+from projservo_cli.store.run_file import Run
+from projservo_cli.words import lines
+
+if TYPE_CHECKING:
+    from projservo_cli.robots.session import Session
+
+
+@dataclass
+class Steps:
+    """The steps of a task, and the connection to the robot that they share."""
+
+    config: Config
+    session: "Session | None" = None  # while they are made
+
+    def connection(self) -> AbstractContextManager[Any]:
+        """Return the connection that steps share, or that says where the arm stands; else nothing."""
+        task = self.config.task
+        if task is None or (not task.steps and task.start_joints is not None):
+            return nullcontext()
+        from projservo_cli.robots.session import Session
+
+        self.session = Session()
+        return self.session
+
+    @property
+    def motions(self) -> list[str]:
+        """Names of the steps that move the arm."""
+        return [name for name, step in self.config.steps.items() if step.moves]
+
+    def opened(self, c: Calibration) -> FloatArray:
+        """Open the robot of somebody's, unless it is, and return where it stands (n,), rad or m."""
+        from projservo_cli.stages.external_robot import opened_robot
+        from projservo_cli.stages.worlds.calibrated import observed_numbers
+
+        inputs = servo_inputs(self.config)
+        assert self.session is not None
+        assert inputs.contract is not None
+        joints = inputs.plan.joints.joints(c.joint_types, c)
+        opened_robot(self.session, inputs.contract.driven, joints, observed_numbers(inputs.plan, c), c.view)
+        actions = {name for step in self.config.steps.values() for name in step.act or ()}
+        self.session.require_acts(actions)  # which refuses what could not act later
+        return self.session.reading()
+
+    def standing(self, c: Calibration) -> FloatArray:
+        """Joints (n,) where the arm stands before anything moves it, rad or m."""
+        if not self.config.plant.simulated:
+            return self.opened(c)
+        if self.config.calibration.reference is None:
+            raise InputError(
+                "task.start: current: a simulated robot stands at calibration.reference: set it, or joints"
+            )
+        return self.config.calibration.reference.values(self.config.joint_types or "")
+
+    def expected(self, part: str, run: Run) -> FloatArray | None:
+        """Return where the arm will stand before a step, by the plan before; None for a given start."""
+        task = self.config.task
+        if task is None:
+            return None
+        k = self.motions.index(part) if part else 0
+        if k == 0:
+            return None if task.start_joints is not None else self.standing(run.calibration)
+        before = self.motions[k - 1]
+        end: FloatArray = run.at_step(before).plan.q[-1]
+        if not np.isfinite(end).all():
+            why = f"since no joints follow the plan of {before}"
+            raise WorkFailed(f"where the arm then stands is open, {why}")
+        return end
+
+    def from_here(self, step: Step, run: Run, inputs: ServoInputs, plan: Plan) -> tuple[ServoInputs, Plan]:
+        """Return the inputs of a step from where the arm stands, and a plan from there."""
+        from projservo_cli.stages import plan as planning
+
+        k, q = self.motions.index(step.part), plan.q_start
+        if k and self.session is not None and self.session.robot is not None:
+            q = self.session.reading()
+        elif k:
+            q = run.traces[f"{self.motions[k - 1]}/{step.law}"].q[-1]
+        inputs = replace(inputs, plan=replace(inputs.plan, q_current=q))
+        if (q != plan.q_start).any():
+            plan = planning.run(inputs.plan, run.calibration, plan)
+        return inputs, plan
+
+    def acted(self, asked: TaskStep, c: Calibration) -> Action:
+        """Have the robot act or wait."""
+        assert self.session is not None
+        if not self.config.plant.simulated:
+            self.opened(c)
+        if asked.act is None:
+            assert asked.wait_s is not None
+            self.session.hold(asked.wait_s)
+            return Action("wait", f"{asked.wait_s:g} s", asked.wait_s)
+        seconds = sum(self.session.act(name, value) for name, value in asked.act.items())
+        said = ", ".join(f"{name} {value:g}" for name, value in asked.act.items())
+        nothing = any(map(self.session.empty, asked.act))
+        return Action("act", said + ", which holds nothing" * nothing, seconds)
+
+    def left_behind(self, part: str) -> str:
+        """Say what stays as it was sent, and which steps of the sequence were not begun."""
+        names = list(self.config.steps)
+        rest = names[names.index(part) + 1 :]
+        kept = "" if self.session is None else ", ".join(lines(self.session.kept))
+        begun = f"{', '.join(rest)} {'was' if len(rest) == 1 else 'were'} not begun" if rest else ""
+        return "".join(
+            f"; {text}" for text in (kept, begun, "the sequence begins again at its first step") if text
+        )
