@@ -135,6 +135,11 @@ class SweepConfig(Root):
         None, description="number of runs made and stored together; null: about one second of work"
     )
 
+    @property
+    def listed_tasks(self) -> tuple[dict[str, Plain], ...]:
+        """Tasks as they are listed; none where they are random, or that of the base."""
+        return () if self.tasks is None else self.tasks.listed or ()
+
     def between(self, sound: Mapping[str, Any]) -> Iterator[Note]:
         """Names and values that stand twice, and axes without effect."""
         if len(names := {pathlib.Path(base).stem for base in self.base}) < len(self.base):
@@ -152,7 +157,7 @@ class SweepConfig(Root):
         """Yield axes over keys of task that the tasks take the place of."""
         if self.tasks is None:
             return
-        kept = () if self.tasks.listed is not None else ("task.start_offset",)
+        kept = () if self.listed_tasks else ("task.start_offset",)
         axes = [(("grid", name), key) for name in self.grid for key in self.keys_of(name)]
         for place, key in [*axes, *((("random", key), key) for key in self.random)]:
             if f"{key}.".startswith("task.") and not key.startswith(kept):

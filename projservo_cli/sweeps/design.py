@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import ItemsView, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
@@ -17,7 +17,7 @@ from projservo_cli.config.inputs import calibration_inputs
 from projservo_cli.config.sweep import BASE, LAW, Distribution, SweepConfig
 from projservo_cli.config.whole import truth_of
 from projservo_cli.laws import law_and_mode, run_names
-from projservo_cli.records import FloatArray, InputError, IntArray
+from projservo_cli.records import InputError, IntArray
 from projservo_cli.result_hashes import digest, key_of
 from projservo_cli.robots.source import source_hash
 from projservo_cli.settings.sections import JointVector
@@ -47,16 +47,6 @@ def _override(what: str, key: str, value: Any) -> Override:
     return Override(f"{what}: {key}={json.dumps(value)}", key, value)
 
 
-def _overrides(what: str, key: str, value: Any) -> list[Override]:
-    """A value of the grid as overrides; that of a law sets its mode too if its name has one."""
-    if key != LAW:
-        return [_override(what, key, value)]
-    law, mode = law_and_mode(value)
-    change = _override(what, key, value)
-    found = [replace(change, key="control.laws", value=[law])]
-    return found if law == value else [*found, replace(change, key="control.mode", value=[mode])]
-
-
 # Streams of the sweep's seed.
 RUNS, _CALIBRATIONS, _TASKS, _VALUES, _CALIBRATION_VALUES, PROBES = range(6)
 _PROBES = 4  # values that show whether a calibration depends on them
@@ -65,17 +55,15 @@ _PROBES = 4  # values that show whether a calibration depends on them
 def _sample(distribution: Distribution, rng: np.random.Generator) -> Any:
     """One value; always as many random numbers, whatever the distribution."""
     uniform, normal = rng.random(), rng.standard_normal()
-    if distribution.uniform is not None:
-        low, high = distribution.uniform
-        return low + (high - low) * uniform
-    if distribution.log_uniform is not None:
-        low, high = distribution.log_uniform
-        return math.exp(math.log(low) + (math.log(high) - math.log(low)) * uniform)
-    if distribution.normal is not None:
-        mean, deviation = distribution.normal
-        return mean + deviation * normal
-    assert distribution.choice is not None
-    return distribution.choice[int(uniform * len(distribution.choice))]
+    match distribution:
+        case Distribution(uniform=(low, high)):
+            return low + (high - low) * uniform
+        case Distribution(log_uniform=(low, high)):
+            return math.exp(math.log(low) + (math.log(high) - math.log(low)) * uniform)
+        case Distribution(normal=(mean, deviation)):
+            return mean + deviation * normal
+    values = distribution.choice or ()
+    return values[int(uniform * len(values))]
 
 
 class _Axis(NamedTuple):
@@ -87,10 +75,17 @@ class _Axis(NamedTuple):
     also: Mapping[str, Mapping[str, Any]] = {}
 
     def changes(self, value: Any) -> Iterator[Override]:
-        """Return the overrides of one of the values."""
+        """Yield the overrides of one of the values; that of a law sets its mode too if its name has one."""
         what = f"grid.{self.name}"
         for key in self.keys:
-            yield from _overrides(what, key, value)
+            change = _override(what, key, value)
+            if key != LAW:
+                yield change
+                continue
+            law, mode = law_and_mode(value)
+            yield replace(change, key="control.laws", value=[law])
+            if law != value:
+                yield replace(change, key="control.mode", value=[mode])
         for key, other in self.also.get(str(value), {}).items():
             yield _override(what, key, other)
 
@@ -183,6 +178,11 @@ class Design:
         """Which base a cell is made from."""
         return cell // (self.cells // len(self.bases))
 
+    def cells_of(self, base: int) -> range:
+        """Cells that are made from a base."""
+        count = self.cells // len(self.bases)
+        return range(base * count, (base + 1) * count)
+
     @lru_cache(maxsize=1024)  # noqa: B019 - a process has one design
     def cell(self, cell: int) -> Config:
         """Configuration of a cell before anything is drawn."""
@@ -195,10 +195,9 @@ class Design:
         if config.plant.use is not None:
             raise InputError(f"base {name}: a sweep drives the simulated robot; leave plant.use out")
         name_of_run(config)
-        assert config.task is not None
-        _require_one_motion(f"base {name}", config.task)
+        _, start = _motion_of(f"base {name}", config)
         control = config.control.model_copy(update={"must_converge": ()})
-        reference = config.calibration.reference or config.task.start_joints
+        reference = config.calibration.reference or start
         calibration = config.calibration.model_copy(update={"reference": reference})
         update = {"name": self.sweep.name, "control": control, "calibration": calibration}
         return config.model_copy(update=update)
@@ -218,61 +217,57 @@ class Design:
         """Hash of all a calibration depends on; cells that share it share the calibration."""
         return key_of(calibration_inputs(self.calibrated(cell, calibration)))
 
-    def calibrations(self) -> Iterator[tuple[str, Config]]:
+    def _places(self) -> Iterator[tuple[int, int]]:
+        """Each cell with the number of each of its calibrations."""
+        return product(range(self.cells), range(min(self.sweep.calibrations, self.sweep.runs)))
+
+    def calibrations(self) -> ItemsView[str, Config]:
         """Key of each calibration that is needed, each once, and a configuration that needs it."""
-        seen = set()
-        for place in product(range(self.cells), range(self._calibrations)):
-            key = self.calibration_key(*place)
-            if key not in seen:
-                seen.add(key)
-                yield key, self.calibrated(*place)
+        needed: dict[str, Config] = {}
+        for place in self._places():
+            needed.setdefault(self.calibration_key(*place), self.calibrated(*place))
+        return needed.items()
 
     def with_covariance(self) -> set[str]:
         """Keys of the calibrations of which a run needs the covariance, each 0.1 MB."""
-        cells = [c for c in range(self.cells) if self.cell(c).trajectory.needs_covariance]
-        return {self.calibration_key(*place) for place in product(cells, range(self._calibrations))}
+        return {
+            self.calibration_key(cell, number)
+            for cell, number in self._places()
+            if self.cell(cell).trajectory.needs_covariance
+        }
 
     @cached_property
     def view(self) -> tuple[str, ...]:
         """Names of the views of all cells."""
         keys = [key for axis in self.axes for key in (*axis.keys, *chain(*axis.also.values()))]
-        step = 1 if any(key.startswith("rig") for key in keys) else self.cells // len(self.bases)
+        step = 1 if any(key.startswith("rig") for key in keys) else len(self.cells_of(0))
         rigs = [self.cell(cell).rig for cell in range(0, self.cells, step)]
         return tuple(dict.fromkeys(name for rig in rigs if rig is not None for name in rig.cameras))
 
-    @property
-    def _calibrations(self) -> int:
-        """Return the number of calibrations of a cell."""
-        return min(self.sweep.calibrations, self.sweep.runs)
-
     @lru_cache(maxsize=64)  # noqa: B019 - a process has one design
-    def tasks(self, base: int) -> tuple[FloatArray, FloatArray]:
-        """Random tasks of a base: joints (k, n) at start and goal, rad or m, one of each stratum in turn."""
+    def random_ends(self, base: int) -> list[tuple[JointVector, ...]]:
+        """Joints at start and goal of the random tasks of a base, one of each stratum in turn."""
         tasks = self.sweep.tasks
-        config = self.cell(base * (self.cells // len(self.bases)))
-        assert config.task is not None
-        assert config.robot is not None
-        assert tasks is not None
-        assert tasks.random is not None
-        assert config.task.start_joints is not None
-        q_front = np.array(config.task.start_joints.values(config.robot.joint_types))
-        rng = np.random.default_rng(np.random.SeedSequence(self.sweep.seed, spawn_key=(_TASKS,)))
+        if tasks is None or tasks.random is None:
+            return []
+        config = self.cell(self.cells_of(base)[0])
+        _, start = _motion_of(f"base {base}", config)
+        q_front = np.array(start.values(config.joint_types or ""))
+        rng = np.random.default_rng(self._stream(_TASKS))
         least_views = config.trajectory.least_views or 0
         low, high = np.radians(tasks.rotation_deg)
-        return random_tasks(truth_of(config), q_front, tasks.random, rng, least_views, (low, high))
+        ends = random_tasks(truth_of(config), q_front, tasks.random, rng, least_views, (low, high))
+        joints = ([JointVector(joints=tuple(q), unit="rad") for q in end.tolist()] for end in ends)
+        return list(zip(*joints, strict=True))
 
     @lru_cache(maxsize=1024)  # noqa: B019 - a process has one design
-    def listed(self, base: int, task: int) -> TaskSettings:
+    def listed(self, base: int, number: int) -> TaskSettings:
         """Return a listed task, with the keys of that of a base which it does not give."""
-        config = self.cell(base * (self.cells // len(self.bases)))
-        assert config.task is not None
-        assert self.sweep.tasks is not None
-        assert self.sweep.tasks.listed is not None
-        given = config.task.model_dump(mode="json", exclude_defaults=True) | self.sweep.tasks.listed[task]
-        change = Override(f"tasks.listed[{task}]", "task", given)
-        found = load_config(config.name, [change], text=to_yaml(config)).task
-        assert found is not None
-        _require_one_motion(f"tasks.listed[{task}]", found)
+        config, where = self.cell(self.cells_of(base)[0]), f"tasks.listed[{number}]"
+        task, _ = _motion_of(where, config)
+        given = task.model_dump(mode="json", exclude_defaults=True) | self.sweep.listed_tasks[number]
+        change = Override(where, "task", given)
+        found, _ = _motion_of(where, load_config(config.name, [change], text=to_yaml(config)))
         return found
 
     def config(self, run: int) -> Config:
@@ -286,16 +281,13 @@ class Design:
             update["task"] = self._task(config, self.base_of(cell), task)
         return config.model_copy(update=update)
 
-    def _task(self, config: Config, base: int, task: int) -> TaskSettings:
+    def _task(self, config: Config, base: int, number: int) -> TaskSettings:
         """Return a task of a base, random or listed, in the configuration of a run."""
-        assert config.task is not None
-        assert self.sweep.tasks is not None
-        if self.sweep.tasks.listed is not None:
-            return self.listed(base, task)
-        ends = self.tasks(base)
-        start, goal = (JointVector(joints=tuple(q[task].tolist()), unit="rad") for q in ends)
-        offset = config.task.start_offset  # stays
-        return TaskSettings(start=start, start_offset=offset, goal=Goal(joints=goal))
+        if self.sweep.listed_tasks:
+            return self.listed(base, number)
+        task, _ = _motion_of(f"base {base}", config)
+        start, goal = self.random_ends(base)[number]
+        return TaskSettings(start=start, start_offset=task.start_offset, goal=Goal(joints=goal))
 
     def drawn(self, run: int) -> dict[str, Any]:
         """Values drawn for a run and for its calibration, in the order of ``random``."""
@@ -303,15 +295,18 @@ class Design:
         found = self._drawn(_VALUES, draw) | self._drawn(_CALIBRATION_VALUES, calibration)
         return {key: found[key] for key in self.sweep.random}
 
+    def _stream(self, *place: int) -> np.random.SeedSequence:
+        """Return the source of the random numbers of a stream, or of one of its draws."""
+        return np.random.SeedSequence(self.sweep.seed, spawn_key=place)
+
     def seed(self, stream: int, number: int) -> int:
         """Seed of one of many draws."""
-        sequence = np.random.SeedSequence(self.sweep.seed, spawn_key=(stream, number))
-        return int(sequence.generate_state(1, np.uint64)[0] >> 1)
+        return int(self._stream(stream, number).generate_state(1, np.uint64)[0] >> 1)
 
     @cached_property
     def _of_calibrations(self) -> set[str]:
         """Return the random keys that a calibration depends on, by probing values."""
-        rng = np.random.default_rng(np.random.SeedSequence(self.sweep.seed, spawn_key=(PROBES,)))
+        rng = np.random.default_rng(self._stream(PROBES))
         probes = [{key: _sample(one, rng) for key, one in self.sweep.random.items()} for _ in range(_PROBES)]
         found = set()
         for key, cell, probe in product(self.sweep.random, range(self.cells), probes[1:]):
@@ -329,7 +324,7 @@ class Design:
         keys = [key for key in self.sweep.random if (key in self._of_calibrations) is of_calibration]
         if not keys:
             return {}
-        rng = np.random.default_rng(np.random.SeedSequence(self.sweep.seed, spawn_key=(stream, number)))
+        rng = np.random.default_rng(self._stream(stream, number))
         return {key: _sample(self.sweep.random[key], rng) for key in keys}
 
 
@@ -349,20 +344,24 @@ def require_sound(design: Design) -> None:
         raise InputError(f"traces: there is no run {run}; the sweep has runs 0 to {design.total - 1}")
     for cell in range(design.cells):
         design.cell(cell)
-    if sweep.tasks is not None and sweep.tasks.listed is not None:
-        for base, task in product(range(len(design.bases)), range(sweep.tasks.count)):
-            design.listed(base, task)
+    for base, number in product(range(len(design.bases)), range(len(sweep.listed_tasks))):
+        design.listed(base, number)
     for draw in range(min(3, sweep.runs) if sweep.random else 0):
         _changed(design.cell(0), design.drawn(draw), f"run {draw}")
 
 
-def _require_one_motion(where: str, task: TaskSettings) -> None:
-    """Refuse a task that is no single motion from given joints, with an InputError."""
-    if task.steps or task.start_joints is None:
+def _motion_of(where: str, config: Config) -> tuple[TaskSettings, JointVector]:
+    """Return the task of a configuration and the joints at its start.
+
+    Raises InputError for a task that is no single motion from given joints.
+    """
+    task = config.task
+    if task is None or task.steps or task.start_joints is None:
         raise InputError(
             f"{where}: a run of a sweep is one motion from given joints: set task.start, and leave "
             "task.steps out; the motions of a sequence may stand one by one in tasks.listed"
         )
+    return task, task.start_joints
 
 
 def name_of_run(config: Config) -> str:

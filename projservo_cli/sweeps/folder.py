@@ -252,9 +252,8 @@ def run_sweep(
         folder.clear()
     try:
         columns_of(design)  # or say why there can be no table, before anything else is made
-        random = design.sweep.tasks is not None and design.sweep.tasks.random is not None
-        for base in range(len(design.bases) if random else 0):
-            design.tasks(base)  # likewise
+        for base in range(len(design.bases)):
+            design.random_ends(base)  # likewise
         _compile_once(design, engine, say)
         wanted = folder.missing_calibrations(design)
         max_workers = 1 + len(wanted) // _CALIBRATIONS
@@ -340,8 +339,7 @@ def _compile_once(design: Design, engine: Engine, say: Callable[[str], None]) ->
 
 def _first_cells(design: Design) -> dict[str, int]:
     """Return the first cell of each law, by the names of their runs."""
-    cells = range(design.cells // len(design.bases))
-    return {name_of_run(design.cell(cell)): cell for cell in reversed(cells)}
+    return {name_of_run(design.cell(cell)): cell for cell in reversed(design.cells_of(0))}
 
 
 def _first_runs(design: Design) -> None:
