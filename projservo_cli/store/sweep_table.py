@@ -90,34 +90,36 @@ def assemble(
     path: Path, parts: Sequence[Path], headings: Sequence[Heading], attributes: Mapping[str, Any]
 ) -> None:
     """Write a table from parts in the given order, a few at a time, with attributes of the file."""
-    rows = sum(_rows(part) for part in parts)
-    size = rows * sum(
-        _TEXT if dtype.startswith("S") else np.dtype(dtype).itemsize for _, dtype, _, _ in headings
-    )
+    rows, failures = 0, dict[str, Failure]()
+    for part in parts:
+        with opened(part, _AGAIN, unchanged=True) as file:
+            rows += len(file["run"])
+            merge_failures(failures, _failures(attribute(file, _FAILURES, dict)).items())
+    texts = {name for name, dtype, *_ in headings if dtype.startswith("S")}
+    size = rows * sum(_TEXT if name in texts else np.dtype(dtype).itemsize for name, dtype, *_ in headings)
     size += sum(part.stat().st_size for part in parts)  # their traces
-    with new_file(path, size) as new, labelled(new) as file:
-        file.attrs.update({"schema": _SCHEMA, "schema_version": _VERSION})
-        file.attrs.update({name: as_attribute(value) for name, value in attributes.items()})
-        file.dimensions["run"] = rows
-        failures: dict[str, Failure] = {}
-        for part in parts:
-            merge_failures(failures, _failures(part))
-        file.attrs[_FAILURES] = json.dumps(failures)
+    with new_file(path, size) as new, labelled(new) as table:
+        table.attrs.update({"schema": _SCHEMA, "schema_version": _VERSION})
+        table.attrs.update({name: as_attribute(value) for name, value in attributes.items()})
+        table.dimensions["run"] = rows
+        table.attrs[_FAILURES] = json.dumps(failures)
         chunks = (max(1, min(rows, _ROWS)),)
         for name, dtype, units, about in headings:
-            if dtype.startswith("S"):  # HDF5 packs no texts of any length
-                data = file.create_variable(name, ("run",), h5py.string_dtype(), chunks=chunks)
+            if name in texts:  # HDF5 packs no texts of any length
+                data = table.create_variable(name, ("run",), h5py.string_dtype(), chunks=chunks)
             else:
-                data = file.create_variable(name, ("run",), dtype, chunks=chunks, **_PACKED)
+                data = table.create_variable(name, ("run",), dtype, chunks=chunks, **_PACKED)
                 data.attrs["units"] = units
             data.attrs["long_name"] = about
         first = 0
-        for block in _blocks(file, parts, [heading[0] for heading in headings]):
+        for block in _blocks(table, parts, [name for name, *_ in headings]):
             last = first + len(block["run"])
-            for name, dtype, _, _ in headings:
+            for name, dtype, *_ in headings:
                 values = np.asarray(block[name], dtype=dtype)
-                is_text = dtype.startswith("S")
-                file[name][first:last] = np.char.decode(values, "utf-8").astype(object) if is_text else values
+                is_text = name in texts
+                table[name][first:last] = (
+                    np.char.decode(values, "utf-8").astype(object) if is_text else values
+                )
             first = last
 
 
@@ -145,15 +147,15 @@ def _blocks(
             waiting = []
 
 
-def _failures(part: Path) -> Iterator[tuple[str, Failure]]:
-    with opened(part, _AGAIN) as file:
-        found = attribute(file, _FAILURES, dict)
-    return ((law, Failure(*one)) for law, one in found.items())
+def _failures(stored: Mapping[str, Any]) -> dict[str, Failure]:
+    """Return failures by the names of laws, as a file has them."""
+    return {law: Failure(*one) for law, one in stored.items()}
 
 
-def _rows(part: Path) -> int:
-    with opened(part, _AGAIN, unchanged=True) as file:
-        return len(file["run"])
+def values_in(cell: int, axes: Sequence[tuple[str, Sequence[Any]]]) -> dict[str, Any]:
+    """Return the value of each axis of a grid in a cell; the last axis runs fastest."""
+    index = np.unravel_index(cell, [len(values) for _, values in axes])
+    return {name: values[int(i)] for (name, values), i in zip(axes, index, strict=True)}
 
 
 class SweepTable:
@@ -174,8 +176,7 @@ class SweepTable:
             is_json = ("{", "[")
             self.attributes = {k: json.loads(v) if str(v).startswith(is_json) else v for k, v in found}
             self.names = tuple(self.attributes["columns"])
-            stored = self.attributes.get(_FAILURES, {})
-            self.failures = {law: Failure(*one) for law, one in stored.items()}  # by law
+            self.failures = _failures(self.attributes.get(_FAILURES, {}))  # by law
             self.rows = len(file["run"])
             self.traces = tuple(sorted(map(int, file.get(_TRACES, ()))))  # numbers of runs
         self._read: dict[str, _Array] = {}
@@ -212,8 +213,7 @@ class SweepTable:
 
     def values(self, cell: int) -> dict[str, Any]:
         """Value of each axis in a cell."""
-        positions = np.unravel_index(cell, [len(values) for _, values in self.axes])
-        return {name: values[int(i)] for (name, values), i in zip(self.axes, positions, strict=True)}
+        return values_in(cell, self.axes)
 
     def cells(self) -> Iterator[tuple[int, BoolArray]]:
         """Each cell that has runs, and which they are."""

@@ -23,6 +23,7 @@ from projservo_cli.robots.source import source_hash
 from projservo_cli.settings.sections import JointVector
 from projservo_cli.settings.task import Goal, TaskSettings
 from projservo_cli.simulation.random_tasks import random_tasks
+from projservo_cli.store.sweep_table import values_in
 
 
 def _changed(config: Config, values: Mapping[str, Any], what: str) -> Config:
@@ -171,8 +172,7 @@ class Design:
 
     def values(self, cell: int) -> dict[str, Any]:
         """Value of each axis in a cell."""
-        index = np.unravel_index(cell, [len(axis.values) for axis in self.axes])
-        return {axis.name: axis.values[int(i)] for axis, i in zip(self.axes, index, strict=True)}
+        return values_in(cell, [(axis.name, axis.values) for axis in self.axes])
 
     def base_of(self, cell: int) -> int:
         """Which base a cell is made from."""

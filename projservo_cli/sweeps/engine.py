@@ -73,7 +73,7 @@ class Engine:
             with self.pool(workers, threads=threads) as pool:
                 try:
                     while True:
-                        todo += islice(left, max(0, 2 * workers - len(futures) - len(todo)))
+                        todo += islice(left, 2 * workers - len(futures) - len(todo))
                         while todo:
                             future = pool.submit(function, todo[0])
                             futures[future] = todo.pop(0)
@@ -106,21 +106,16 @@ class Engine:
     def pool(self, workers: int, *, threads: bool) -> Iterator[Executor]:
         """Workers to submit jobs to; in the end processes go at once, threads with the jobs they are at."""
         if threads:
-            with threadpool_limits(1):  # for all threads together, or one would end that of another
-                pool = ThreadPoolExecutor(workers)
-                try:
-                    yield pool
-                finally:
-                    pool.shutdown(cancel_futures=True)
+            # One limit for all threads together, or one would end that of another.
+            with threadpool_limits(1), ThreadPoolExecutor(workers) as of_threads:
+                yield of_threads
             return
-        spawn = multiprocessing.get_context("spawn")
-        of_processes = ProcessPoolExecutor(workers, spawn, _follow_the_parent)
+        pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _follow_the_parent)
         try:
-            yield of_processes
+            yield pool
         finally:
-            processes = list((of_processes._processes or {}).values())
-            results = of_processes._result_queue
-            of_processes.shutdown(wait=False, cancel_futures=True)
+            processes, results = list((pool._processes or {}).values()), pool._result_queue
+            pool.shutdown(wait=False, cancel_futures=True)
             for process in processes:
                 process.terminate()
             # One that ended amid a result leaves a part of it, for the rest of which this process would wait.
