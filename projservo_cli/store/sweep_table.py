@@ -116,19 +116,10 @@ def assemble(
             last = first + len(block["run"])
             for name, dtype, *_ in headings:
                 values = np.asarray(block[name], dtype=dtype)
-                is_text = name in texts
-                table[name][first:last] = (
-                    np.char.decode(values, "utf-8").astype(object) if is_text else values
-                )
+                if name in texts:
+                    values = np.char.decode(values, "utf-8").astype(object)
+                table[name][first:last] = values
             first = last
-
-
-def _values(data: h5py.Dataset) -> _Array:
-    """Decode the values (k,) of a column; texts of a table a few at a time, to those of fixed width."""
-    if data.dtype.kind != "O":
-        return np.asarray(data[()])
-    texts = data.asstr()
-    return np.concatenate([texts[i : i + _ROWS].astype(str) for i in range(0, max(len(data), 1), _ROWS)])
 
 
 def _blocks(
@@ -138,7 +129,7 @@ def _blocks(
     waiting: list[dict[str, _Array]] = []
     for part in parts:
         with opened(part, _AGAIN) as source:
-            waiting.append({name: _values(source[name]) for name in names})
+            waiting.append({name: source[name][()] for name in names})
             for run in source.get(_TRACES, ()):
                 trace = load_record(source[f"{_TRACES}/{run}"], Trace, dict(SIZES))
                 save_record(file.create_group(f"{_TRACES}/{run}"), trace)
@@ -223,7 +214,13 @@ class SweepTable:
     def column(self, name: str) -> _Array:
         """Values (k,) of a column; texts as Python texts would be, of fixed width."""
         with opened(self.path, _AGAIN) as file:
-            return _values(file[name])
+            data = file[name]
+            if data.dtype.kind != "O":
+                return np.asarray(data[()])
+            texts = data.asstr()  # of any length, a few at a time
+            return np.concatenate(
+                [texts[i : i + _ROWS].astype(str) for i in range(0, max(len(data), 1), _ROWS)]
+            )
 
     def trace(self, run: int) -> Trace:
         """Stored trace of a run. Raises InputError if it was not stored."""

@@ -43,6 +43,9 @@ _CALIBRATIONS = 8  # that one process makes in less time than it takes to start 
 _SETTINGS = 64  # as many of a cell, and a part has many runs of each, nearly all of whose time is compiled
 
 
+_Records = tuple[Observation, Calibration, CrossValidation | None]  # of a calibration
+
+
 class _Status(NamedTuple):
     """Progress of a sweep: stored and total runs; ``complete`` once its parts are merged."""
 
@@ -50,15 +53,6 @@ class _Status(NamedTuple):
     total: int
     chunk: int  # runs of a part; 0 before it began
     complete: bool = False
-
-
-class _Calibrated(NamedTuple):
-    """Calibration of a key: records, or the reason of a failure."""
-
-    key: str
-    config: Config
-    records: tuple[Observation, Calibration, CrossValidation | None] | None
-    reason: str = ""
 
 
 class Folder:
@@ -196,14 +190,14 @@ class Folder:
             if not any(self.calibration(key).with_suffix(kind).exists() for kind in (".h5", _REFUSED))
         ]
 
-    def keep_calibration(self, made: _Calibrated) -> None:
+    def keep_calibration(self, key: str, config: Config, made: _Records | str) -> None:
         """Store a calibration as a separate run file, or the reason of its failure."""
-        path = self.calibration(made.key)
-        if made.records is None:
-            write_whole(path.with_suffix(_REFUSED), made.reason + "\n")
+        path = self.calibration(key)
+        if isinstance(made, str):
+            write_whole(path.with_suffix(_REFUSED), made + "\n")
             return
-        (step,) = steps_for(made.config, Run(path), ["calibrate"])
-        save(Run(path, stored_yaml(made.config), {"calibrate": result_of(step, made.config, *made.records)}))
+        (step,) = steps_for(config, Run(path), ["calibrate"])
+        save(Run(path, stored_yaml(config), {"calibrate": result_of(step, config, *made)}))
 
     def calibrations(self, design: Design) -> dict[str, Calibration | None]:
         """Calibrations by their key, None where one was refused; with covariance where a plan needs it."""
@@ -259,7 +253,7 @@ def run_sweep(
         max_workers = 1 + len(wanted) // _CALIBRATIONS
         with closing(engine.completed(_calibrate, wanted, max_workers=max_workers)) as calibrated:
             for count, one in enumerate(calibrated, 1):
-                folder.keep_calibration(one)
+                folder.keep_calibration(*one)
                 progress("calibrations", count, len(wanted))
         if status.done:
             say(f"{status.done} of {status.total} runs are stored already")
@@ -316,13 +310,13 @@ def _in_kernel(design: Design, cell: int) -> bool:
     return is_compiled(design, servo_inputs(config), name_of_run(config))
 
 
-def _calibrate(wanted: tuple[str, Config]) -> _Calibrated:
-    """Make the calibration of a key, on one thread like all that must be the same to the bit."""
+def _calibrate(wanted: tuple[str, Config]) -> tuple[str, Config, _Records | str]:
+    """Make the calibration of a key, or tell why there is none; on one thread, to be the same to the bit."""
     with threadpool_limits(1):
         try:
-            return _Calibrated(*wanted, calibrate.run(inputs_of("calibrate", wanted[1])))
+            return (*wanted, calibrate.run(inputs_of("calibrate", wanted[1])))
         except WorkFailed as error:
-            return _Calibrated(*wanted, None, str(error))
+            return (*wanted, str(error))
 
 
 def _compile_once(design: Design, engine: Engine, say: Callable[[str], None]) -> None:
@@ -344,8 +338,8 @@ def _first_cells(design: Design) -> dict[str, int]:
 
 def _first_runs(design: Design) -> None:
     """One calibration and a run of each law with it, for the kernels they leave."""
-    made = _calibrate((design.calibration_key(0, 0), design.calibrated(0, 0)))
-    calibration = None if made.records is None else made.records[1]
+    _, _, made = _calibrate((design.calibration_key(0, 0), design.calibrated(0, 0)))
+    calibration = None if isinstance(made, str) else made[1]
     for cell in _first_cells(design).values():
         run = cell * design.sweep.runs
         run_part(Part(design, run, run + 1, {design.calibration_key(cell, 0): calibration}))

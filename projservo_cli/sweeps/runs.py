@@ -113,14 +113,14 @@ def columns_of(design: Design) -> tuple[Heading, ...]:
     axes = [_input(axis.name, axis.values, "value of the grid") for axis in design.axes]
     random = design.sweep.random.items()
     drawn = [_input(key, given.choice or (0.0,), "value drawn for the run") for key, given in random]
-    between = (BETWEEN,) if design.sweep.between_samples else ()
-    others = (*NUMBERED, *measured_columns(design.view), *between)
-    for name in {column.name for column in others} & {axis.name for axis in (*axes, *drawn)}:
+    measured = (*measured_columns(design.view), *([BETWEEN] if design.sweep.between_samples else []))
+    taken = {column.name for column in (*NUMBERED, *measured)}
+    for name in taken.intersection(axis.name for axis in (*axes, *drawn)):
         raise InputError(
             f"grid.{name}: the table has another column of this name: call the axis otherwise, such as "
             f"my_{name}: {{keys: [{name}], values: [...]}}"
         )
-    return (*NUMBERED, *axes, *drawn, *measured_columns(design.view), *between)
+    return (*NUMBERED, *axes, *drawn, *measured)
 
 
 def _input(name: str, values: Sequence[Any], about: str) -> Heading:

@@ -108,9 +108,6 @@ def _chance(first: int, second: int) -> float:
     return float(binomtest(first, first + second).pvalue) if first + second else 1.0
 
 
-_STATISTICS = "statistics.json"
-
-
 def _drawn(data: Any, draw: Any) -> Any:
     """Draw a figure in its size; that of the basin is the larger one."""
     height, width = (4.0, style.WIDTH) if draw is draw_basin else (2.9, 0.65 * style.WIDTH)
@@ -124,7 +121,7 @@ def report(path: Path, formats: Sequence[str], progress: Progress) -> tuple[dict
     found = {"runs": table.rows, "total": table.attributes["total"], "cells": cells}
     found["paired"] = list(_paired(table))
     text = json.dumps(found, indent=1, allow_nan=False) + "\n"
-    files = [write_whole(folder / _STATISTICS, text)]
+    files = [write_whole(folder / "statistics.json", text)]
     figures = list(pictures(table))
     for done, (name, data, draw) in enumerate(figures):
         progress("figures", done, len(figures))
