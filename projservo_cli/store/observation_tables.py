@@ -285,16 +285,9 @@ def _recording(path: Path | str) -> str | None:
     return found.pop() if len(found) == 1 else None
 
 
-def write_table(
-    observation: Observation,
-    path: Path | str,
-    *,
-    recording: str = "",
-    identity: str = "",
-    mount: str = WORLD,
-) -> None:
+def write_table(observation: Observation, path: Path | str, **columns: str) -> None:
     """Write an observation table, as ``table_text`` has it."""
-    write_whole(Path(path), table_text(observation, recording=recording, identity=identity, mount=mount))
+    write_whole(Path(path), table_text(observation, **columns))
 
 
 def table_text(
@@ -353,14 +346,13 @@ def to_csv(arrays: Mapping[str, npt.NDArray[Any]], down: int | None = None) -> s
 
 def _columns(name: str, array: npt.NDArray[Any], down: int | None) -> Iterator[tuple[str, list[str]]]:
     """Heading and cells of each column of an array; a scalar is a column of one entry."""
-    if array.ndim < 2:
-        yield name, [_cell(value) for value in np.atleast_1d(array).tolist()]
-        return
+    array = np.atleast_1d(array)
     down = int(np.argmax(array.shape)) if down is None else down
     rows = np.moveaxis(array, down, 0)
     for index in np.ndindex(*rows.shape[1:]):
-        axes = [*map(str, index[:down]), ":", *map(str, index[down:])]
-        yield f"{name}[{','.join(axes)}]", [_cell(value) for value in rows[(slice(None), *index)].tolist()]
+        axes = ",".join([*map(str, index[:down]), ":", *map(str, index[down:])])
+        heading = f"{name}[{axes}]" if index else name
+        yield heading, [_cell(value) for value in rows[(slice(None), *index)].tolist()]
 
 
 def _cell(value: Any) -> str:
