@@ -80,13 +80,13 @@ class _Axis(NamedTuple):
         what = f"grid.{self.name}"
         for key in self.keys:
             change = _override(what, key, value)
-            if key != LAW:
+            if key == LAW:
+                law, mode = law_and_mode(value)
+                yield replace(change, key="control.laws", value=[law])
+                if law != value:
+                    yield replace(change, key="control.mode", value=[mode])
+            else:
                 yield change
-                continue
-            law, mode = law_and_mode(value)
-            yield replace(change, key="control.laws", value=[law])
-            if law != value:
-                yield replace(change, key="control.mode", value=[mode])
         for key, other in self.also.get(str(value), {}).items():
             yield _override(what, key, other)
 

@@ -272,10 +272,10 @@ def run_sweep(
 def _make_parts(design: Design, folder: Folder, engine: Engine, status: _Status, progress: Progress) -> None:
     """Make the parts that are missing."""
     calibrations, threads = folder.calibrations(design), _shares_settings(design)
-    chunk = status.chunk or design.sweep.chunk
+    chunk = status.chunk
     if not chunk:
-        chunk = min(_SHARED if threads else _OWN, math.ceil(design.total / (_PARTS * engine.workers)))
-    if not status.chunk:
+        most = _SHARED if threads else _OWN
+        chunk = design.sweep.chunk or min(most, math.ceil(design.total / (_PARTS * engine.workers)))
         folder.begin(design, chunk)
 
     def part(first: int, last: int) -> Part:
