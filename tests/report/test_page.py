@@ -201,5 +201,3 @@ def test_what_is_known_of_a_calibration_is_told(run, tmp_path):
         "lens of the left camera, k1 −0.0625",
     ):
         assert part in text, part
-    unknown = dataclasses.replace(calibration, prediction_noise=np.full(6, np.nan))
-    assert "states no uncertainty" in told(unknown)
