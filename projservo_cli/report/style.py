@@ -18,7 +18,6 @@ from projservo_cli.records import BoolArray, FloatArray
 if TYPE_CHECKING:
     from matplotlib.axes import Axes as Axes
     from matplotlib.figure import Figure as Figure
-    from matplotlib.gridspec import GridSpec
 
 FORMATS = ("svg", "pdf", "png")
 WIDTH = 6.9  # inches across both columns of a page
@@ -147,6 +146,7 @@ def _arrange(figure: "Figure") -> None:
     engine: Any = figure.get_layout_engine()
     if engine is None:
         return
+    _name_ordinates_once(figure)
     images: list[Any] = [axes for axes in figure.axes if axes.get_label() == _IMAGE]
     for axes in images:  # matplotlib calls it for each size that it tries, before it looks at tick labels
         axes.apply_aspect = partial(_equal_scales, axes, axes.get_xlim(), axes.get_ylim())
@@ -163,6 +163,17 @@ def _arrange(figure: "Figure") -> None:
     for axes in images:
         axes.apply_aspect()
     figure.set_layout_engine()  # with an engine, even one that does nothing, saving draws twice
+
+
+def _name_ordinates_once(figure: "Figure") -> None:
+    """Leave the name of an ordinate to the first of more than two panels in a row, which stand closer."""
+    named: dict[Any, list[Axes]] = {}
+    for axes in figure.axes:
+        if (place := axes.get_subplotspec()) is not None:
+            named.setdefault((place.rowspan.start, axes.get_ylabel()), []).append(axes)
+    for same in named.values():
+        for axes in same[1:] if len(same) > 2 else ():
+            axes.set_ylabel("")
 
 
 def _equal_scales(
@@ -234,28 +245,18 @@ def separator(views: int) -> str:
     return "\n" if views > 2 else ", "
 
 
-def images_above(figure: "Figure", views: int, heights: Sequence[float]) -> tuple["GridSpec", list[Any]]:
-    """A grid whose first row holds images side by side, and its others two halves; cells of the images."""
-    grid = figure.add_gridspec(len(heights), int(np.lcm(2, views)), height_ratios=heights)
-    columns = np.split(np.arange(grid.ncols), views)
-    return grid, [grid[0, int(part[0]) : int(part[-1]) + 1] for part in columns]
-
-
-def name_first_ordinate(panels: Sequence["Axes"]) -> None:
-    """Leave the name of the ordinate to the first of more than two panels, which stand closer."""
-    for panel in panels[1:] if len(panels) > 2 else ():
-        panel.set_ylabel("")
-
-
 def zero_line(axes: "Axes") -> None:
     """Draw the line at which a margin is used up."""
     axes.axhline(0.0, color=BLACK, linewidth=0.6)
 
 
-def image_axes(axes: "Axes", title: str, pixels: FloatArray, margin: float = 0.06) -> None:
-    """Axes of an image that show all pixels (…, 2) with a margin, v down, and widen to fill their panel."""
+def image_axes(axes: "Axes", title: str, pixels: FloatArray | None = None, margin: float = 0.06) -> None:
+    """Axes of an image, v down, that widen to fill their panel.
+
+    They show all pixels (…, 2), by default all that is drawn so far, with a margin.
+    """
     axes.set(title=title, xlabel="u (px)", ylabel="v (px)", label=_IMAGE)
-    points = pixels.reshape(-1, 2)
+    points = axes.dataLim.get_points() if pixels is None else pixels.reshape(-1, 2)
     points = points[np.isfinite(points).all(axis=1)]
     low, high = points.min(axis=0), points.max(axis=0)
     pad = margin * max(float((high - low).max()), 1.0)

@@ -1,33 +1,26 @@
 """Figures after those of [RH00]: named arrays from a run, and a drawing of them.
 
 A figure is a pair of functions ``data(material) -> arrays`` and ``draw(data, figure)``, which registers it
-in a file with those of its topic; to add one, write both, and name the file here if it is new. Three of them
-are drawn of a single result too, whoever made it.
+in a file of this folder with those of its topic. Some are drawn of a single result too, whoever made it.
 """
 
+from importlib import import_module
+from pkgutil import iter_modules
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from projservo_cli.records import Calibration, CrossValidation, Observation, Plan, Trace, position_limits
-from projservo_cli.report.figures import (
-    calibration,
-    errors,
-    images,
-    joint_space,
-    path_deviation,
-    planned,
-    scene,
-)
+from projservo_cli.report.figures import scene
 from projservo_cli.report.report_data import REGISTER, Fit, title
 from projservo_cli.task.face import cyclic_order
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# Figures register themselves where their topic is imported.
-_TOPICS = (calibration, errors, images, joint_space, path_deviation, planned, scene)
+for _topic in iter_modules(__path__, f"{__name__}."):  # figures register themselves where they are imported
+    import_module(_topic.name)
 FIGURES = tuple(REGISTER[name] for name in sorted(REGISTER))
 
 

@@ -17,7 +17,7 @@ from projservo_cli.calibration.prediction import (
     prediction_variance,
 )
 from projservo_cli.records import BoolArray, Calibration, FloatArray, IntArray, Observation
-from projservo_cli.report import style
+from projservo_cli.report import panels, style
 from projservo_cli.report.report_data import Data, Fit, registered
 
 _ARROW = 0.04  # length of an arrow of the rms residual, as a fraction of the extent of the observations
@@ -206,19 +206,15 @@ def _expected_residual(predicted: FloatArray, sigma: float) -> FloatArray:
 def _draw(data: Data, figure: "style.Figure") -> None:
     """Residuals over the images; their histogram and error of each pose; excitation and information."""
     views = [name.removeprefix("seen_") for name in data if name.startswith("seen_")]
-    grid, cells = style.images_above(figure, len(views), (1.15, 1.0, 0.9))
-    cameras = [figure.add_subplot(cell) for cell in cells]
+    cameras, (residuals, poses), (joints, directions) = panels.rows(
+        figure, (len(views), 2, 2), (1.15, 1.0, 0.9)
+    )
     for axes, view in zip(cameras, views, strict=True):
         _arrows(axes, data, view, style.separator(len(views)))
-    style.name_first_ordinate(cameras)
-    half = grid.ncols // 2
-    panels = [
-        [figure.add_subplot(grid[i, columns]) for columns in (slice(half), slice(half, None))] for i in (1, 2)
-    ]
-    _histogram(panels[0][0], data)
-    _poses(panels[0][1], data)
-    _excitation(panels[1][0], data)
-    _spectrum(panels[1][1], data)
+    _histogram(residuals, data)
+    _poses(poses, data)
+    _excitation(joints, data)
+    _spectrum(directions, data)
     notes = [
         _RESIDUAL | {"label": f"residual, {data['factor']:,g} times"},
         style.line(style.PALE, width=6, label="95 % of poses in the model"),

@@ -1,11 +1,9 @@
 """Figs. 9, 10 and 12 of [RH00]: control errors and joints under direct control, over time."""
 
-import math
-
 import numpy as np
 
 from projservo_cli.records import FloatArray, Trace
-from projservo_cli.report import style
+from projservo_cli.report import panels, style
 from projservo_cli.report.report_data import (
     Data,
     Driven,
@@ -32,7 +30,6 @@ _TRANSLATION = {
 _THIN = 0.6  # points, of differences with true operators
 _HIDES = 3.0  # times the step of the slower half of the joints, beyond which a step hides theirs
 _LIMIT = style.line(style.GREY, width=0.8)
-_RUN_PATH = style.line(style.GREY, width=0.8, label="path of a marker")
 _WAYS = (("free", False), ("limited", True))  # without and with the limit of the joint speed
 
 
@@ -167,8 +164,7 @@ def _enlarge(axes: "style.Axes", t: FloatArray, steps: FloatArray, chosen: list[
     if not 0.0 < _HIDES * half < float(largest[-1]):
         return
     inset = axes.inset_axes((0.52, 0.56, 0.45, 0.38))
-    for i in chosen:
-        inset.plot(t, steps[:, i], **style.curve(i))
+    panels.columns(inset, t, steps[:, chosen], map(style.curve, chosen))
     inset.set(xlim=axes.get_xlim(), ylim=(-half, half))
     inset.tick_params(labelsize=6.5)
     inset.text(0.97, 0.93, "enlarged", ha="right", va="top", fontsize=6.5, transform=inset.transAxes)
@@ -206,10 +202,8 @@ def _draw_joints(data: Data, figure: "style.Figure") -> None:
     for (joints, steps), (chosen, unit) in zip(axes.reshape(-1, 2, 2), kinds, strict=True):
         for panel, panel_below, (name, limited) in zip(joints, steps, _WAYS, strict=True):
             t = data[f"t_s_{name}"]
-            for i in chosen:
-                line = style.curve(i)
-                panel.plot(t, data[f"q_{name}"][:, i], **line)
-                panel_below.plot(t[:-1], data[f"step_{name}"][:, i], **line)
+            panels.columns(panel, t, data[f"q_{name}"][:, chosen], map(style.curve, chosen))
+            panels.columns(panel_below, t[:-1], data[f"step_{name}"][:, chosen], map(style.curve, chosen))
             if limited and unit == "deg":
                 for bound in (-limit, limit):
                     panel_below.axhline(bound, **_LIMIT)
@@ -259,30 +253,17 @@ def _draw_runs(data: Data, figure: "style.Figure") -> None:
     """Two rows a run: above the images, below its curves over time."""
     runs, names, slides = [str(name) for name in data["run"]], data["view"], data["prismatic"]
     figure.set_figheight(4.4 * len(runs) + 0.5)
-    columns = math.lcm(len(names), 3)
-    grid = figure.add_gridspec(2 * len(runs), columns)
+    rows = panels.rows(figure, [len(names), 3] * len(runs))
     units = "deg or mm" if slides.any() and not slides.all() else "mm" if slides.all() else "deg"
-
-    def panels(row: int, count: int) -> list["style.Axes"]:
-        width = columns // count
-        return [figure.add_subplot(grid[row, k * width : (k + 1) * width]) for k in range(count)]
-
-    for k, name in enumerate(runs):
-        s, s_star, t = data[f"s_{name}"], data[f"s_star_{name}"], data[f"t_s_{name}"]
-        for view, panel in enumerate(images := panels(2 * k, len(names))):
-            style.paths(panel, s[:, view], _RUN_PATH)
-            style.start_and_goal(panel, s[0, view], s_star[view])
-            below = "" if view else f"{data[f'verdict_{name}']}\n"
-            pixels = np.concatenate([s[:, view], s_star[None, view]])
-            style.image_axes(panel, f"{below}{names[view]} camera", pixels)
-        style.name_first_ordinate(images)
-        error, joints, commands = panels(2 * k + 1, 3)
+    lines = [style.curve(i, f"$q_{{{i + 1}}}$") for i in range(len(slides))]
+    for name, images, (error, joints, commands) in zip(runs, rows[::2], rows[1::2], strict=True):
+        panels.images(images, [panels.Run(data[f"s_{name}"], panels.PATH)], data[f"s_star_{name}"])
+        panels.cameras(images, names, str(data[f"verdict_{name}"]))
+        t = data[f"t_s_{name}"]
         error.plot(t, data[f"error_px_{name}"], **style.line(style.BLACK))
         style.log_scale(error)
-        for i in range(len(slides)):
-            line = style.curve(i, f"$q_{{{i + 1}}}$")
-            joints.plot(t, data[f"q_{name}"][:, i], **line)
-            commands.plot(t[:-1], data[f"q_dot_{name}"][:, i], **line)
+        panels.columns(joints, t, data[f"q_{name}"], lines)
+        panels.columns(commands, t[:-1], data[f"q_dot_{name}"], lines)
         ordinates = "error (px)", f"joint ({units})", f"velocity ({units} per s)"
         for panel, what in zip((error, joints, commands), ordinates, strict=True):
             panel.set(ylabel=what, xlabel="time (s)")

@@ -3,7 +3,6 @@
 import io
 import math
 import textwrap
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,12 +10,9 @@ from projservo_cli.geometry.kinematics import project
 from projservo_cli.laws import BODY_LAWS, POINT_LAWS, title_of
 from projservo_cli.loop.verdicts import plateau_stretches
 from projservo_cli.records import CORNERS, ByteArray, FloatArray, IntArray, Trace
-from projservo_cli.report import style
+from projservo_cli.report import panels, style
 from projservo_cli.report.report_data import DIRECT, Data, Driven, ReportData, percent, registered, title
 from projservo_cli.task.face import cyclic_order
-
-if TYPE_CHECKING:
-    from matplotlib.gridspec import GridSpec
 
 _PANELS_WIDTH, _PANEL_WIDTH = 5.8, 3.6  # inches, of all panels side by side, and of one at most
 _PATH = style.line(style.BLACK, width=0.9, label="path of a marker")
@@ -64,26 +60,17 @@ def _draw_classical(data: Data, figure: "style.Figure") -> None:
     drawn = [np.concatenate([data[f"s_{law}"], data[f"s_star_{law}"][None]]) for law in laws]
     near = [[style.near_pixels(s[:, view], size[view]) for view in range(len(names))] for s in drawn]
     heights = [_panel_width(len(names)) * style.aspect(np.concatenate(pixels)) for pixels in near]
-    # Of two cameras the second has a name of its own; else each has, below that of the law.
-    titles = 0.62 if len(names) == 2 else 0.78
-    figure.set_figheight(sum(heights) + titles * len(laws) + 0.45)
-    axes = figure.subplots(len(laws), len(names), squeeze=False, height_ratios=heights)
-    for row, law, pixels in zip(axes, laws, near, strict=True):
-        for view, (panel, name) in enumerate(zip(row, names, strict=True)):
-            s = data[f"s_{law}"][:, view]
-            style.paths(panel, s, style.HIDDEN, mask=data[f"hidden_{law}"][:, view])
-            style.paths(panel, s, _PATH)
+    figure.set_figheight(sum(heights) + 0.78 * len(laws) + 0.45)
+    rows = panels.rows(figure, [len(names)] * len(laws), heights)
+    for row, law, pixels in zip(rows, laws, near, strict=True):
+        s = data[f"s_{law}"]
+        panels.images(row, [panels.Run(s, _PATH, data[f"hidden_{law}"])], data[f"s_star_{law}"])
+        for view, panel in enumerate(row):
             for first, last in data[f"plateau_{law}"]:
-                style.paths(panel, s[first : last + 1], _PLATEAU | {"markevery": [0]})
-            panel.plot(*s[-1].T, **_STOPPED)
-            style.start_and_goal(panel, s[0], data[f"s_star_{law}"][view])
-            heading = f"{name} camera"
-            if not view:
-                below = "" if len(names) == 2 else f"\n{heading}"
-                heading = f"{title_of(law)}: {data[f'verdict_{law}']}{below}"
-            style.image_axes(panel, heading, pixels[view])
+                style.paths(panel, s[first : last + 1, view], _PLATEAU | {"markevery": [0]})
+            panel.plot(*s[-1, view].T, **_STOPPED)
             style.border(panel, size[view], pixels[view])
-        style.name_first_ordinate(row)
+        panels.cameras(row, names, f"{title_of(law)}: {data[f'verdict_{law}']}", pixels)
     style.legend_below(figure, 4)
 
 
@@ -105,17 +92,12 @@ def _data_direct(report_data: ReportData) -> Data:
 )
 def _draw_direct(data: Data, figure: "style.Figure") -> None:
     """Both laws over one another, one panel a camera."""
-    runs = np.concatenate([data[f"s_{law}"] for law in DIRECT])
-    names = data["view"]
-    figure.set_figheight(_panel_width(len(names)) * style.aspect(runs) + 1.05)
-    panels = figure.subplots(1, len(names), squeeze=False)[0]
-    for view, (panel, name) in enumerate(zip(panels, names, strict=True)):
-        goal = data["s_star"][view]
-        for law in DIRECT:
-            style.paths(panel, data[f"s_{law}"][:, view], style.LAW_LINES[law] | {"label": title_of(law)})
-        style.start_and_goal(panel, runs[0, view], goal)
-        style.image_axes(panel, f"{name} camera", np.concatenate([goal[None], runs[:, view]]))
-    style.name_first_ordinate(panels)
+    runs = [panels.Run(data[f"s_{law}"], style.LAW_LINES[law] | {"label": title_of(law)}) for law in DIRECT]
+    names, aspect = data["view"], style.aspect(np.concatenate([run.s for run in runs]))
+    figure.set_figheight(_panel_width(len(names)) * aspect + 1.05)
+    (row,) = panels.rows(figure, [len(names)])
+    panels.images(row, runs, data["s_star"])
+    panels.cameras(row, names)
     style.legend_below(figure, 4)
 
 
@@ -223,17 +205,9 @@ def _data_overview(report_data: ReportData) -> Data:
 def _draw_overview(data: Data, figure: "style.Figure") -> None:
     """Left the images of the cameras, right the errors."""
     names = data["view"]
-    pixels = [
-        np.concatenate(
-            [
-                data["s_star"][view],
-                data["center"][:, view],
-                *(data[f"s_{law}"][:, view].reshape(-1, 2) for law in _OVERVIEW_LAWS),
-            ]
-        )
-        for view in range(len(names))
-    ]
-    aspect, rows = style.aspect(np.concatenate(pixels), *_ASPECTS), max(2, len(names))
+    shown = ("s_star", "center", *(f"s_{law}" for law in _OVERVIEW_LAWS))
+    pixels = np.concatenate([data[name].reshape(-1, 2) for name in shown])
+    aspect, rows = style.aspect(pixels, *_ASPECTS), max(2, len(names))
     figure.set_figheight(rows * _IMAGE_WIDTH * aspect + 1.75 + 0.6 * (rows - 2) + _LEGEND_ROOM / 72.0)
     grid = figure.add_gridspec(rows, 2, width_ratios=(_IMAGE_WIDTH, _ERRORS_WIDTH))
     cells = [grid[:, 0]] if len(names) == 1 else [grid[view, 0] for view in range(rows)]
@@ -243,14 +217,11 @@ def _draw_overview(data: Data, figure: "style.Figure") -> None:
     errors += [figure.add_subplot(grid[1:, 1])]
     images += [figure.add_subplot(cell) for cell in cells[2:]]
     lines = {law: style.LAW_LINES[law] | {"label": str(data[f"verdict_{law}"])} for law in _OVERVIEW_LAWS}
-    for view, (panel, name) in enumerate(zip(images, names, strict=True)):
-        for law, line in reversed(lines.items()):
-            s = data[f"s_{law}"][:, view]
-            style.paths(panel, s, style.HIDDEN, mask=data[f"hidden_{law}"][:, view])
-            style.paths(panel, s, line)
+    runs = [panels.Run(data[f"s_{law}"], line, data[f"hidden_{law}"]) for law, line in lines.items()]
+    panels.images(images, runs[::-1], data["s_star"])
+    for view, panel in enumerate(images):
         panel.plot(*data["center"][:, view].T, **_CENTER)
-        style.start_and_goal(panel, data[f"s_{DIRECT[0]}"][0, view], data["s_star"][view])
-        style.image_axes(panel, f"{name} camera", pixels[view])
+    panels.cameras(images, names)
     _control_errors(errors[0], data)
     for law, line in lines.items():
         e, hidden = data[f"image_error_{law}"], data[f"hidden_{law}"].any(axis=1)
@@ -285,6 +256,7 @@ _FACE = style.line(style.GREEN, width=1.2, label="face")
 _DRIVEN = style.line(style.VERMILION, width=0.9, label="path of a marker")
 OF_TOOL = style.line(style.GREEN, width=3.6, marker="o", label="features of the tool")
 OF_SCENE = style.line(style.BLUE, style.DASHED, 1.4, "o", "features of the scene")
+_OF_TOOL_AT_START = OF_TOOL | style.START | {"label": "features of the tool at the start"}
 _FINE = {"linewidth": 1.6, "markersize": 2.0}  # over frames
 _FAINT_FACE = style.line(style.GREY, width=0.7, label="face at the start and at the end")
 
@@ -318,12 +290,6 @@ def _shown_run(report_data: Driven | ReportData, field: str) -> tuple[str, Trace
     """Name and trace of the first direct law, else of the first, of the runs that have an array."""
     runs = [run for run in report_data.traces.items() if getattr(run[1], field) is not None]
     return next((run for run in runs if run[0] in BODY_LAWS), runs[0])
-
-
-def _side_by_side(figure: "style.Figure", grid: "GridSpec", row: int, count: int) -> list["style.Axes"]:
-    """So many panels of one width in a row of a grid."""
-    width = grid.ncols // count
-    return [figure.add_subplot(grid[row, k * width : (k + 1) * width]) for k in range(count)]
 
 
 def _data_frames(report_data: Driven | ReportData) -> Data:
@@ -375,8 +341,8 @@ def _draw_frames(data: Data, figure: "style.Figure") -> None:
     sizes = np.array([data[f"frames_{view}"].shape[1:] for view in range(len(names))])
     heights = style.WIDTH / 3.0 * sizes[:, 0] / sizes[:, 1]
     figure.set_figheight(float(heights.sum()) + 1.1 + 0.4 * max(0, len(names) - 2))
-    panels = figure.subplots(len(names), 3, squeeze=False, height_ratios=heights)
-    for (view, i), panel in np.ndenumerate(panels):
+    axes = figure.subplots(len(names), 3, squeeze=False, height_ratios=heights)
+    for (view, i), panel in np.ndenumerate(axes):
         height, width = sizes[view]
         panel.imshow(data[f"frames_{view}"][i], cmap="gray", vmin=0, vmax=255)
         s = data["s"][: data["instant"][i] + 1, view]
@@ -455,51 +421,47 @@ def _data_incidences(report_data: ReportData | Driven) -> Data:
 def _draw_incidences(data: Data, figure: "style.Figure") -> None:
     """Above a panel for each camera, below one for each incidence with a curve for each run."""
     names, count, free = data["view"], len(data["incidence"]), int(data["free_dof"])
-    pixels = [
-        np.concatenate([part.reshape(-1, 2) for part in (face, tool, data["feature_there"][:, :, view])])
-        for view, (face, tool) in enumerate(
-            zip(data["face"].swapaxes(0, 1), np.moveaxis(data["feature"], 3, 0), strict=True)
-        )
-    ]
+    shown = [data["face"], np.moveaxis(data["feature"], 3, 1), np.moveaxis(data["feature_there"], 2, 0)[None]]
+    pixels = [np.concatenate([part[:, view].reshape(-1, 2) for part in shown]) for view in range(len(names))]
     height = _panel_width(len(names)) * style.aspect(np.concatenate(pixels), _LEAST_ASPECT)
     rows = math.ceil(count / _PANELS)
     across = math.ceil(count / rows)
     figure.set_figheight(height + rows * _ERRORS_HEIGHT)
     heights = height, *(_ERRORS_HEIGHT - 1.1,) * rows
-    grid = figure.add_gridspec(1 + rows, math.lcm(len(names), across), height_ratios=heights)
-    images = _side_by_side(figure, grid, 0, len(names))
-    for view, (panel, name) in enumerate(zip(images, names, strict=True)):
+    images, *below = panels.rows(figure, [len(names), *[across] * rows], heights)
+    for view, panel in enumerate(images):
         for face in data["face"][:, view]:
             style.face(panel, face, _FAINT_FACE)
         start, end = data["feature"][:, :, :, view]
-        panel.plot(
-            *style.outlines(start).T, **OF_TOOL | style.START | {"label": "features of the tool at the start"}
-        )
+        panel.plot(*style.outlines(start).T, **_OF_TOOL_AT_START)
         panel.plot(*style.outlines(end).T, **OF_TOOL)
         panel.plot(*style.outlines(data["feature_there"][:, :, view]).T, **OF_SCENE)
-        _draw_free(
-            panel, data, view, _ARROW * np.ptp(pixels[view][np.isfinite(pixels[view][:, 0])], axis=0).max()
-        )
-        run = f"{data['run']}, " if not view else ""
-        left = f"{free or 'no'} joint motion{'s' * (free != 1)} free" if not view and free >= 0 else ""
-        style.image_axes(panel, f"{name} camera" if view else f"{run}{left}\n{name} camera", pixels[view])
-    panels = [panel for row in range(rows) for panel in _side_by_side(figure, grid, 1 + row, across)]
-    for panel in panels[count:]:
+        extent = np.ptp(pixels[view][np.isfinite(pixels[view][:, 0])], axis=0)
+        _draw_free(panel, data, view, _ARROW * extent.max())
+    left = f", {free or 'no'} joint motion{'s' * (free != 1)} free" if free >= 0 else ""
+    panels.cameras(images, names, f"{data['run']}{left}", pixels)
+    errors = [panel for row in below for panel in row]
+    for panel in errors[count:]:
         panel.remove()
-    runs = [name.removeprefix("px_") for name in data if name.startswith("px_")]
-    errors = np.concatenate([np.maximum(data[f"px_{name}"], _LEAST_PX).ravel() for name in runs])
-    lowest, highest = (bound(errors, initial=1.0, where=np.isfinite(errors)) for bound in (np.min, np.max))
-    for k, (panel, incidence) in enumerate(zip(panels, data["incidence"], strict=False)):
-        for i, name in enumerate(runs):
-            error = np.maximum(data[f"px_{name}"][:, k], _LEAST_PX)
-            if np.isfinite(error).any():
-                panel.plot(data[f"t_s_{name}"], error, **style.curve(i, title(name)))
-        style.log_scale(panel)
-        heading = textwrap.fill(str(incidence), _TITLES // across) + _within(data, k)
-        panel.set(title=heading, xlabel="time (s)", ylim=(0.5 * lowest, 2.0 * highest))
-    for panel in panels[:count:across]:
-        panel.set_ylabel("error (px at one px of noise)")
+    for k, (panel, incidence) in enumerate(zip(errors, data["incidence"], strict=False)):
+        _errors_of_runs(panel, data, k)
+        panel.set_title(textwrap.fill(str(incidence), _TITLES // across) + _within(data, k))
     style.legend_below(figure, 4)
+
+
+def _errors_of_runs(panel: "style.Axes", data: Data, k: int) -> None:
+    """Draw the error of an incidence over time, a curve for each run, on the scale of all incidences."""
+    runs = {name.removeprefix("px_"): data[name] for name in data if name.startswith("px_")}
+    every = np.concatenate([errors.ravel() for errors in runs.values()])
+    every = np.maximum(every[np.isfinite(every)], _LEAST_PX)
+    for i, (name, errors) in enumerate(runs.items()):
+        if np.isfinite(errors[:, k]).any():
+            panel.plot(
+                data[f"t_s_{name}"], np.maximum(errors[:, k], _LEAST_PX), **style.curve(i, title(name))
+            )
+    style.log_scale(panel)
+    panel.set(ylim=(0.5 * every.min(initial=1.0), 2.0 * every.max(initial=1.0)))
+    panel.set(xlabel="time (s)", ylabel="error (px at one px of noise)")
 
 
 def _within(data: Data, k: int) -> str:
@@ -586,17 +548,14 @@ def _data_object(report_data: ReportData | Driven) -> Data:
 def _draw_object(data: Data, figure: "style.Figure") -> None:
     """A panel for each camera."""
     names, tags = data["view"], data["marker"] // CORNERS
-    panels = _side_by_side(figure, figure.add_gridspec(1, len(names)), 0, len(names))
-    for view, (panel, name) in enumerate(zip(panels, names, strict=True)):
-        taught, now = data["taught"][view], data["now"][view]
+    (row,) = panels.rows(figure, [len(names)])
+    for panel, taught, now, face in zip(row, data["taught"], data["now"], data["face"], strict=True):
         moved = np.stack([taught, now], axis=1)
         panel.plot(*style.outlines(moved[np.isfinite(moved).all(axis=(1, 2))]).T, **_MOVED)
         for shown, line in ((taught, _TAUGHT), (now, _NOW)):
             each = [style.outlines(shown[None, tags == tag]) for tag in dict.fromkeys(tags.tolist())]
             panel.plot(*np.concatenate(each).T, **line)
-        style.face(panel, data["face"][view], _CARRIED)
-        pixels = np.concatenate([taught, now, data["face"][view]])
-        style.image_axes(panel, f"{name} camera", pixels[np.isfinite(pixels).all(axis=1)])
-    style.name_first_ordinate(panels)
+        style.face(panel, face, _CARRIED)
+    panels.cameras(row, names)
     figure.suptitle(textwrap.fill(str(data["about"]), 90))
     style.legend_below(figure, 2)

@@ -8,7 +8,7 @@ import numpy as np
 from projservo_cli.geometry.kinematics import forward_kinematics, project
 from projservo_cli.image_size import BEHIND
 from projservo_cli.records import FloatArray, Plan
-from projservo_cli.report import style
+from projservo_cli.report import panels, style
 from projservo_cli.report.report_data import Data, ReportData, joint_kinds, joint_units, registered
 
 PIECES = 4  # of each edge of a tree, which is no straight line in an image
@@ -19,7 +19,6 @@ _NEAR, _NEAR_PX = 1.0, 10.0  # margins and distances up to which a scale to ten 
 _SUBSCRIPTS = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")  # as text, which takes a tenth of formulas
 # Dashes of what each camera has; dotted is what is required.
 _SIDES: tuple[Any, ...] = (style.SOLID, (0, (4, 1.5)), style.DASH_DOTTED, (0, (3, 1, 1, 1, 1, 1)))
-_PATH = style.line(style.GREY, width=0.8, label="path of a marker")
 _CENTER = style.line(style.GREEN, width=1.6, label="path of the centre")
 _CORNER = style.dots(style.VERMILION, "|", "a rounded corner begins, ends", markersize=8.0)
 _TREES = {
@@ -131,17 +130,23 @@ def _draw(data: Data, figure: "style.Figure") -> None:
     kinds, names = joint_kinds(data["prismatic"]), data["view"].tolist()
     visible = [_visible(data, view) for view in range(len(names))]
     image = _IMAGES_WIDTH / max(2, len(names)) * style.aspect(np.concatenate(visible), upper=_HIGHEST)
-    figure.set_figheight(image + 2.0 * _ROW + 1.9)
-    grid, places = style.images_above(figure, len(names), [image, _ROW, _ROW])
-    images = [figure.add_subplot(place) for place in places]
+    figure.set_figheight(image + 2.0 * _ROW + 2.05)
+    images, (joints, shares), (slides, distances) = panels.rows(
+        figure, [len(names), 2, 2], [image, _ROW, _ROW]
+    )
     for view, panel in enumerate(images):
-        _image(panel, data, view, visible[view])
-    style.name_first_ordinate(images)
-    half = grid.ncols // 2
-    cells = (grid[1:, :half],) if len(kinds) == 1 else (grid[1, :half], grid[2, :half])
-    for cell, (chosen, unit) in zip(cells, kinds, strict=True):
-        _joints(figure.add_subplot(cell), data, chosen, unit)
-    shares, distances = figure.add_subplot(grid[1, half:]), figure.add_subplot(grid[2, half:])
+        _around(panel, data, view)
+    panels.images(images, [panels.Run(data["s"], panels.PATH)], data["s_star"])
+    panels.cameras(images, names, str(data["name"]), visible)
+    for view, panel in enumerate(images):
+        _center(panel, data, data["center"][:, view])
+        style.border(panel, data["image_size"][view], visible[view])
+    if len(kinds) == 1:
+        slides.remove()
+        place: Any = joints.get_subplotspec()
+        joints.set_subplotspec(place.get_gridspec()[1:, : place.colspan.stop])
+    for panel, (chosen, unit) in zip((joints, slides), kinds, strict=False):
+        _joints(panel, data, chosen, unit)
     _constraints(shares, data, _SHARES, _NEAR)
     _constraints(distances, data, _DISTANCES, _NEAR_PX)
     shares.set(ylabel="margin (1)", xlabel="")
@@ -176,22 +181,20 @@ def _visible(data: Data, view: int) -> FloatArray:
     )
 
 
-def _image(axes: "style.Axes", data: Data, view: int, visible: FloatArray) -> None:
-    """Draw trees, paths, faces and kept-out regions in the image of one camera."""
+def _around(axes: "style.Axes", data: Data, view: int) -> None:
+    """Draw kept-out regions and trees in the image of one camera."""
     for region in _kept_out(data, view):
         axes.fill(*region.T, **_KEPT_OUT)
     for name, line in _TREES.items():
         if f"tree_{name}" in data:
             axes.plot(*data[f"tree_{name}"][:, view].T, **line)
-    s, center = data["s"][:, view], data["center"][:, view]
-    style.paths(axes, s, _PATH)
+
+
+def _center(axes: "style.Axes", data: Data, center: FloatArray) -> None:
+    """Draw the path (k, 2) of the centre in an image, and where rounded corners of it begin and end."""
     axes.plot(*center.T, **_CENTER)
     if (ends := data["corner_s"].ravel()).size:
         axes.plot(*(np.interp(ends, _time(data)[0], column) for column in center.T), **_CORNER)
-    style.start_and_goal(axes, s[0], data["s_star"][view])
-    names = data["view"]
-    style.image_axes(axes, f"{names[view]} camera{style.separator(len(names))}{data['name']}", visible)
-    style.border(axes, data["image_size"][view], visible)
 
 
 def _time(data: Data) -> tuple[FloatArray, str]:

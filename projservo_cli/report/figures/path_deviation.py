@@ -1,5 +1,6 @@
 """Drift of the centre from its straight line: for several gains, Fig. 8 of [RH00], and by mode."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,6 @@ _PATH_POINTS = 400
 _WHIRL = np.pi  # with a longer joint step, rad or m, the arm winds up: its path is drawn at the instants only
 _WIDE = 10.0  # modes that differ more have a logarithmic scale, down to a fraction of the smallest
 _LEAST_SHOWN = 0.02
-_ALONG, _OFF = "way along the straight line (mm)", "distance from it (mm)"
 _RESOLUTION = np.radians(1.0)  # longest joint motion, rad or m, between two points of a drawn path
 _OPERATORS = ("true", "calibrated")
 # Largest deviations by operators and limit, both 0 or 1.
@@ -110,13 +110,8 @@ def _draw(data: Data, figure: "style.Figure") -> None:
     ]
     axes = figure.subplots(2, 2, width_ratios=[1.5, 1])
     for (path_axes, gain_axes), deviation, law in zip(axes, data["path_deviation_mm"], DIRECT, strict=True):
-        paths = [data[f"path_mm_{law}_{i}"] for i in range(len(lines))]
-        for path, line in zip(paths, lines, strict=True):
-            path_axes.plot(path[:, 0], style.positive(path[:, 1]), **line)
-        path_axes.set(title=f"{title_of(law)}: path of the centre, calibrated operators")
-        path_axes.set(xlabel=_ALONG, ylabel=_OFF)
-        style.log_scale(path_axes)
-        path_axes.set_ylim(bottom=_LEAST_SHOWN * min(float(path[:, 1].max()) for path in paths))
+        _paths(path_axes, [data[f"path_mm_{law}_{i}"] for i in range(len(lines))], lines, wide=True)
+        path_axes.set_title(f"{title_of(law)}: path of the centre, calibrated operators")
         for (operators, limited), line in _MAXIMA.items():
             label = f"{_OPERATORS[operators]}, {limit if limited else 'no limit'}"
             size = 4.5 if operators else 3.0  # an empty marker shows around a full one
@@ -178,14 +173,24 @@ def _data_modes(report_data: ReportData) -> Data:
 def _draw_modes(data: Data, figure: "style.Figure") -> None:
     """Draw the distance of the centre from its line over the distance along it, one curve per run."""
     axes = figure.subplots()
-    runs = {str(name): data[f"path_mm_{name}"] for name in data["names"]}
-    upper = [float(path[:, 1].max()) for path in runs.values()]
-    wide = min(upper) > 0.0 and max(upper) > _WIDE * min(upper)
-    for i, (name, path) in enumerate(runs.items()):
-        off = style.positive(path[:, 1]) if wide else path[:, 1]
-        axes.plot(path[:, 0], off, **style.curve(i, title(name)))
-    axes.set(title="path of the centre", xlabel=_ALONG, ylabel=_OFF)
+    paths = [data[f"path_mm_{name}"] for name in data["names"]]
+    farthest = [float(path[:, 1].max()) for path in paths]
+    lines = [style.curve(i, title(name)) for i, name in enumerate(data["names"].tolist())]
+    _paths(axes, paths, lines, wide=min(farthest) > 0.0 and max(farthest) > _WIDE * min(farthest))
+    axes.set_title("path of the centre")
+    style.legend_below(figure, 2)
+
+
+def _paths(
+    axes: "style.Axes", paths: Sequence[FloatArray], lines: Sequence[style.LineStyle], *, wide: bool
+) -> None:
+    """Draw distances from the straight line over the way along it, of paths (k, 2), mm.
+
+    wide : on a logarithmic scale, which has no place for 0.
+    """
+    for path, line in zip(paths, lines, strict=True):
+        axes.plot(path[:, 0], style.positive(path[:, 1]) if wide else path[:, 1], **line)
+    axes.set(xlabel="way along the straight line (mm)", ylabel="distance from it (mm)")
     if wide:
         style.log_scale(axes)
-        axes.set_ylim(bottom=_LEAST_SHOWN * min(upper))
-    style.legend_below(figure, 2)
+        axes.set_ylim(bottom=_LEAST_SHOWN * min(float(path[:, 1].max()) for path in paths))

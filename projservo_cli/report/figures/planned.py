@@ -1,6 +1,5 @@
 """Figs. 1, 2, 5 and 6 of [RH00]: the parts of the task and the planned motions, with their visibility."""
 
-from collections.abc import Iterable
 from contextlib import suppress
 from typing import Any
 
@@ -12,7 +11,7 @@ from projservo_cli.geometry.lens import distort_visible
 from projservo_cli.geometry.stereo import triangulate_points
 from projservo_cli.image_size import border_distance
 from projservo_cli.records import FloatArray, WorkFailed
-from projservo_cli.report import style
+from projservo_cli.report import panels, style
 from projservo_cli.report.report_data import Data, ReportData, registered
 from projservo_cli.simulation.arm import METRIC_A_INF, roll_axis
 from projservo_cli.task.face import cyclic_order
@@ -25,7 +24,6 @@ _TARGETS = {
     "A_t": style.line(style.VERMILION, style.DOTTED, label="goal less translation $A_t$"),
     "A_r": style.line(style.GREEN, style.DASH_DOTTED, label="less rotation onto the plane $A_r$"),
 }
-_PART_PATH = style.line(style.GREY, width=0.7, label="paths of the markers")
 _AXIS = style.line(style.BLACK, (0, (8, 3, 1, 3)), 0.8, label=r"axis of $\hat H_r$")
 _SENSES = (style.line(style.BLUE), style.line(style.VERMILION, style.DASHED))
 _HIDDEN = style.line(style.GREY, width=4, label="hidden from this camera", alpha=0.5, solid_capstyle="butt")
@@ -82,7 +80,7 @@ def _axis(H_hat: FloatArray, A_c: FloatArray, A: FloatArray) -> FloatArray:
 )
 def _draw_partition(data: Data, figure: "style.Figure") -> None:
     """Three panels, one a part."""
-    panels = figure.subplots(1, 3, width_ratios=[1.1, 1, 1])
+    row = figure.subplots(1, 3, width_ratios=[1.1, 1, 1])
     onto, within = (_signed(angle) for angle in data["angles_deg"])
     moved = np.stack([data["A_t"], data["A_star"]])
     parts = (
@@ -90,16 +88,15 @@ def _draw_partition(data: Data, figure: "style.Figure") -> None:
         (rf"onto plane, $\theta_r$ = {onto}°", data["onto_plane"], ("A_r", "A_t")),
         (rf"within plane, $\theta_p$ = {within}°", data["within_plane"], ("A_r",)),
     )
-    panels[1].plot(*data["axis"].T, **_AXIS)
-    for panel, (title, paths, ends) in zip(panels, parts, strict=True):
-        axis = [data["axis"]] if panel is panels[1] else []
-        style.paths(panel, paths, _PART_PATH)
+    row[1].plot(*data["axis"].T, **_AXIS)
+    for panel, (title, paths, ends) in zip(row, parts, strict=True):
+        style.paths(panel, paths, panels.PATH)
         style.face(panel, data["A"], _START, fill=True)
         for name in ends:
             style.face(panel, data[name], _TARGETS[name])
-        style.image_axes(panel, title, np.concatenate([data["A"], paths.reshape(-1, 2), *axis]))
+        style.image_axes(panel, title)
     arrow = {"arrowstyle": "->", "linewidth": 0.9}
-    panels[0].annotate("", data["center"][1], data["center"][0], arrowprops=arrow)
+    row[0].annotate("", data["center"][1], data["center"][0], arrowprops=arrow)
     style.legend_below(figure, 3)
 
 
@@ -144,25 +141,23 @@ def _data_visibility(report_data: ReportData) -> Data:
 def _draw_visibility(data: Data, figure: "style.Figure") -> None:
     """Per camera: the images along both senses of θ_r, and the margin over θ_r and over τ."""
     names = data["view"]
-    panels = figure.subplots(3, len(names), squeeze=False, height_ratios=[1.9, 1.0, 0.9])
+    rows = panels.rows(figure, [len(names)] * 3, [1.9, 1.0, 0.9])
     senses = [
         line | {"label": rf"sense $\theta_r$ = {_signed(angle)}°"}
         for line, angle in zip(_SENSES, data["theta_deg"][:, -1], strict=True)
     ]
-    for view, (name, (image, turned, moved)) in enumerate(zip(names, panels.T, strict=True)):
+    for view, (image, turned, moved) in enumerate(zip(*rows, strict=True)):
         images, margins = data["images"][:, :, view], data["theta_margin"][..., view]
         style.face(image, images[0, 0], style.START | {"label": "face at the start"}, fill=True)
         for s, margin, line in zip(images, margins, senses, strict=True):
             style.paths(image, s, _HIDDEN, mask=margin <= 0.0)
             style.paths(image, s, line | {"linewidth": 0.9})
             style.face(image, s[-1], line)
-        style.image_axes(image, f"{name} camera", images)
         _angle(turned, data["theta_deg"], margins, senses, data["theta_0_deg"][view])
         _translation(moved, data["tau_share"], data["tau_margin"][:, view], data["tau_0_share"][view])
-    for row in panels:
-        style.name_first_ordinate(row)
+    panels.cameras(rows[0], names)
     if len(names) > 2:  # panels are narrow
-        for turned, moved in panels[1:].T:
+        for turned, moved in zip(*rows[1:], strict=True):
             turned.set_title(turned.get_title().replace(" and ", ", "))
             moved.set_xlabel(r"share of $\tau$ (1)")
     style.legend_below(figure, 3, [_END])
@@ -336,12 +331,12 @@ def _draw_planned(data: Data, figure: "style.Figure") -> None:
     sigma, shares = data["sigma"], None
     if np.isfinite(data["mu"]).all():
         shares = figure.add_subplot(grid[0, 1])
-        _columns(shares, sigma, data["mu"], _SHARES)
+        panels.columns(shares, sigma, data["mu"], _SHARES)
         shares.set_ylabel(_SHARE)
         shares.tick_params(labelbottom=False)
     # A path through joint space has no shares.
     margins = figure.add_subplot(grid[1, 1] if shares else grid[:, 1], sharex=shares)
-    _columns(margins, sigma, data["margin"], style.view_lines(data["view"]))
+    panels.columns(margins, sigma, data["margin"], style.view_lines(data["view"]))
     style.zero_line(margins)
     margins.set(xlabel=_SIGMA, ylabel=_MARGIN)
     style.legend_below(figure, 6, [style.dots(style.BLACK, "o", "first marker of the face")])
@@ -362,12 +357,6 @@ def _faces(axes: "style.Axes", data: Data) -> None:
     paper = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.8}
     for corners, label in ((faces[0], "start"), (faces[-1], "goal")):
         axes.annotate(label, corners[np.argmin(corners[:, 1])], bbox=paper, **place)
-
-
-def _columns(axes: "style.Axes", x: FloatArray, values: FloatArray, lines: Iterable[style.LineStyle]) -> None:
-    """Draw each column of values (k, c) over x (k,), in its style."""
-    for column, line in zip(values.T, lines, strict=True):
-        axes.plot(x, column, **line)
 
 
 def _data_path(report_data: ReportData) -> Data:
@@ -429,16 +418,12 @@ def _border_distance(report_data: ReportData, mu: FloatArray) -> FloatArray:
 def _draw_path(data: Data, figure: "style.Figure") -> None:
     """Above the map of each camera with the path, below the shares and the margins along it."""
     names = data["view"]
-    grid, cells = style.images_above(figure, len(names), [1.5, 1.0])
-    maps = [figure.add_subplot(cell) for cell in cells]
+    maps, (shares, margins) = panels.rows(figure, [len(names), 2], [1.5, 1.0])
     for view, (panel, name) in enumerate(zip(maps, names, strict=True)):
         _map(panel, data, view)
         panel.set_title(f"{name} camera{style.separator(len(names))}{data['profile']} profile")
-    style.name_first_ordinate(maps)
-    half = grid.ncols // 2
-    shares, margins = (figure.add_subplot(cell) for cell in (grid[1, :half], grid[1, half:]))
-    _columns(shares, data["sigma"], data["mu"], _SHARES)
-    _columns(margins, data["sigma"], data["along"], _MARGINS)
+    panels.columns(shares, data["sigma"], data["mu"], _SHARES)
+    panels.columns(margins, data["sigma"], data["along"], _MARGINS)
     shares.set(xlabel=_SIGMA, ylabel=_SHARE)
     margins.set(xlabel=_SIGMA, ylabel="margin (1)")
     style.zero_line(margins)

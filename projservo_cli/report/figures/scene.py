@@ -1,6 +1,6 @@
 """Fig. 3 of [RH00], robot, rig and face; and arm, cameras and the tool's uncertainty to scale, in metres."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from itertools import combinations
 from typing import Any
@@ -23,13 +23,19 @@ from projservo_cli.task.face import center_of
 _PYRAMID = 0.16  # length of the drawn viewing pyramids, as a share of the distance to the face
 _ROBOT = style.line(style.BLACK, width=2.0, marker="o", markersize=4)
 _GOAL = style.line(style.PURPLE, (0, (3, 1)), 1.6, label="face at the goal")  # blue is the first camera
-_AT_GOAL = style.line(style.PURPLE, width=1.2, marker="o", markersize=3, label="robot at the goal", alpha=0.6)
 _RIG_AT_GOAL = style.line(style.PURPLE, width=0.8, label="cameras at the goal")
-_FACE = "face at the start", "face"  # of cameras that stand still, and of those on the tool
-_FEATURES = style.line(style.BLACK, width=1.4, marker=".", markersize=5, label="features of the tool")
-_SCENE_FEATURES = style.line(style.PURPLE, width=1.4, marker=".", markersize=5, label="features of the scene")
-_ROLL_AXIS = style.line(style.GREEN, style.DASH_DOTTED, 0.9, label="roll axis of the rig")
-_LINE = style.line(style.GREY, style.DOTTED, label="straight line of the centre")
+_FEATURES: style.LineStyle = {"linewidth": 1.4, "marker": ".", "markersize": 5}
+# Lines of the scene by their names in the data, the lowest first.
+_LINES = {
+    "roll_axis": style.line(style.GREEN, style.DASH_DOTTED, 0.9, label="roll axis of the rig"),
+    "robot_goal": style.line(
+        style.PURPLE, width=1.2, marker="o", markersize=3, label="robot at the goal", alpha=0.6
+    ),
+    "robot": _ROBOT | {"label": "robot at the start"},
+    "line": style.line(style.GREY, style.DOTTED, label="straight line of the centre"),
+    "features_start": style.line(style.BLACK, label="features of the tool") | _FEATURES,
+    "features_scene": style.line(style.PURPLE, label="features of the scene") | _FEATURES,
+}
 
 
 def _data(report_data: ReportData) -> Data:
@@ -161,39 +167,13 @@ def _rectangle(low: FloatArray, high: FloatArray) -> FloatArray:
 )
 def _draw(data: Data, figure: "style.Figure") -> None:
     """One view in perspective with equal scales."""
-    axes, on_tool = _space(figure, data), "pyramids_goal" in data
-    visible = [data["robot"], data["face_start"]]
-    for name, line in (("roll_axis", _ROLL_AXIS), ("robot_goal", _AT_GOAL)):
-        if name in data:
-            axes.plot(*data[name].T, **line)
-            visible.append(data[name])
-    for camera in data.get("pyramids_goal", ()):
-        axes.plot(*edges_of(camera).T, **_RIG_AT_GOAL)
-        visible.append(camera)
-    axes.plot(*data["robot"].T, **_ROBOT, label="robot at the start")
-    axes.plot(*style.closed(data["face_start"]).T, **style.START | {"label": _FACE[on_tool]})
+    lines = [(data[name], line) for name, line in _LINES.items() if name in data]
+    lines += [(edges_of(camera), _RIG_AT_GOAL) for camera in data.get("pyramids_goal", ())]
+    label = "face" if "pyramids_goal" in data else "face at the start"  # before cameras on the tool it stays
+    lines.append((style.closed(data["face_start"]), style.START | {"label": label}))
     if "face_goal" in data:
-        axes.plot(*style.closed(data["face_goal"]).T, **_GOAL)
-        axes.plot(*data["line"].T, **_LINE)
-        visible.append(data["face_goal"])
-    for name, line in (("features_start", _FEATURES), ("features_scene", _SCENE_FEATURES)):
-        if name in data:
-            axes.plot(*data[name].T, **line)
-            visible.append(data[name][np.isfinite(data[name]).all(axis=1)])
-    _show(axes, figure, data["pyramids"], np.concatenate(visible))
-
-
-def _space(figure: "style.Figure", data: Data) -> Any:
-    """Axes in three dimensions with the pyramids of the cameras."""
-    axes: Any = figure.add_axes((0, 0, 1, 1), projection="3d", proj_type="persp", focal_length=0.9)
-    axes.patch.set_visible(False)
-    axes.computed_zorder = False
-    for (center, *corners), line in zip(data["pyramids"], style.view_lines(data["view"]), strict=True):
-        edges = line | {"linestyle": style.SOLID, "linewidth": 1.0}
-        axes.plot(*style.closed(np.stack(corners)).T, **edges)
-        for corner in corners:
-            axes.plot(*np.stack([center, corner]).T, **edges)
-    return axes
+        lines.append((style.closed(data["face_goal"]), _GOAL))
+    _show(figure, data, lines)
 
 
 def edges_of(pyramid: FloatArray) -> FloatArray:
@@ -202,11 +182,20 @@ def edges_of(pyramid: FloatArray) -> FloatArray:
     return np.concatenate([np.concatenate([corner[None], apex, corner[None]]) for corner in corners])
 
 
-def _show(axes: Any, figure: "style.Figure", rig: FloatArray, points: FloatArray) -> None:
-    """Show a rig and points (k, 3) with equal scales, seen from the side of the rig, above a legend."""
+def _show(figure: "style.Figure", data: Data, lines: Sequence[tuple[FloatArray, style.LineStyle]]) -> None:
+    """Show the cameras and lines (k, 3), which NaN divides, with equal scales, from the side of the rig."""
     from matplotlib.ticker import MultipleLocator
 
-    points = np.concatenate([points, rig.reshape(-1, 3)])
+    axes: Any = figure.add_axes((0, 0, 1, 1), projection="3d", proj_type="persp", focal_length=0.9)
+    axes.patch.set_visible(False)
+    axes.computed_zorder = False
+    rig = data["pyramids"]
+    for camera, line in zip(rig, style.view_lines(data["view"]), strict=True):
+        axes.plot(*edges_of(camera).T, **line | {"linestyle": style.SOLID, "linewidth": 1.0})
+    for points, line in lines:
+        axes.plot(*points.T, **line)
+    points = np.concatenate([rig.reshape(-1, 3), *(points for points, _ in lines)])
+    points = points[np.isfinite(points).all(axis=1)]
     low, high = points.min(axis=0), points.max(axis=0)
     longest = (high - low).max()
     # Room for the numbers of each axis.
@@ -352,15 +341,12 @@ def _data_metric(report_data: Fit) -> Data:
 )
 def _draw_metric(data: Data, figure: "style.Figure") -> None:
     """One view in perspective; regions as three ellipses each."""
-    axes = _space(figure, data)
-    axes.plot(*data["robot"].T, **_ROBOT, label="arm at one pose")
     largest = MM * float(np.linalg.norm(data["semi_axes"], axis=2).max())
     region = f"95 % region of the tool, {float(data['factor']):,g} times (at most {largest:.3g} mm)"
     angle = np.linspace(0.0, 2.0 * np.pi, 61)[:, None]
-    visible = [data["robot"]]
+    lines = [(data["robot"], _ROBOT | {"label": "arm at one pose"})]
     for center, semi in zip(data["tool"], float(data["factor"]) * data["semi_axes"], strict=True):
         for a, b in ((0, 1), (1, 2), (2, 0)):
             ring = center + np.cos(angle) * semi[a] + np.sin(angle) * semi[b]
-            axes.plot(*ring.T, **_ELLIPSOID, label=region)
-            visible.append(ring)
-    _show(axes, figure, data["pyramids"], np.concatenate(visible))
+            lines.append((ring, _ELLIPSOID | {"label": region}))
+    _show(figure, data, lines)

@@ -6,8 +6,6 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
-from scipy.stats import binomtest
 
 from projservo_cli.report import style
 from projservo_cli.report.report_data import Data
@@ -26,6 +24,8 @@ def wilson_interval(successes: int, count: int) -> tuple[float, float]:
     Source: E. B. Wilson, "Probable inference, the law of succession, and statistical inference",
     Journal of the American Statistical Association 22 (1927), p. 209.
     """
+    from scipy.stats import binomtest  # takes longer to import than all figures
+
     interval = binomtest(successes, count).proportion_ci(0.95, "wilson")
     return float(interval.low), float(interval.high)
 
@@ -98,7 +98,7 @@ def _final_errors(table: SweepTable) -> Data:
     return data
 
 
-def _draw_success(data: Data, figure: Figure) -> None:
+def _draw_success(data: Data, figure: "style.Figure") -> None:
     """Success of each law, ``<law>.rate``, from ``.low`` to ``.high``, over ``.x``, which is a ``label``."""
     axes = figure.add_subplot()
     laws = _laws(data, ".rate")
@@ -113,7 +113,7 @@ def _draw_success(data: Data, figure: Figure) -> None:
     style.legend_below(figure, min(3, len(laws)))
 
 
-def draw_basin(data: Data, figure: Figure) -> None:
+def draw_basin(data: Data, figure: "style.Figure") -> None:
     """Success of each law over two start offsets, as a map with a panel for each; pale where none begins.
 
     ``data`` has ``x`` (k,), ``y`` (j,), ``label_x``, ``label_y`` and for each law ``<law>.share`` (j, k).
@@ -139,7 +139,7 @@ def draw_basin(data: Data, figure: Figure) -> None:
     figure.colorbar(mesh, ax=panels.tolist(), label="success (%)")
 
 
-def _draw_final_errors(data: Data, figure: Figure) -> None:
+def _draw_final_errors(data: Data, figure: "style.Figure") -> None:
     """Share of the runs of each law that end within a distance of the goal.
 
     ``data`` has for each law ``<law>.error`` (k,), mm, sorted, and ``<law>.share`` (k,) of all its runs.
