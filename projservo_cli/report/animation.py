@@ -403,7 +403,8 @@ def _frames(traces: Mapping[str, Trace], order: IntArray, sizes: FloatArray) -> 
                 style.start_and_goal(panel, run.s[0, view, order], run.s_star[view, order], fill=False)
                 if run.feature_s_star is not None:
                     panel.plot(*style.outlines(run.feature_s_star[:, :, view]).T, **OF_SCENE)
-                style.image_axes(panel, "" if view else f"{title(name)}\nrunning", near, margin)
+                style.image_axes(panel, near, margin)
+                panel.set_title("" if view else f"{title(name)}\nrunning")
                 panel.set_ylabel("" if columns else f"{camera} camera\nv (px)")
                 panel.set_xlabel("u (px)" if view == views - 1 else "")
             features = np.zeros((len(run.s), 0, 3, views, 2)) if run.feature_s is None else run.feature_s

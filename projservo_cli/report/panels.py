@@ -2,9 +2,10 @@
 
 import math
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from projservo_cli.records import BoolArray, FloatArray
 from projservo_cli.report import style
@@ -52,12 +53,41 @@ def cameras(
 
     pixels : (k, 2) of each image.
     """
-    for panel, name, shown in zip(row, names, pixels or [None] * len(row), strict=True):
+    titles(row, names, heading)
+    for panel, shown in zip(row, pixels or [None] * len(row), strict=True):
+        style.image_axes(panel, shown)
+
+
+def titles(row: Sequence["style.Axes"], names: Iterable[str], heading: str = "") -> None:
+    """Title panels by their cameras, the first below a heading too."""
+    for panel, name in zip(row, names, strict=True):
         above = f"{heading}\n" if heading and panel is row[0] else ""
-        style.image_axes(panel, f"{above}{name} camera", shown)
+        panel.set_title(f"{above}{name} camera")
 
 
 def columns(axes: "style.Axes", x: FloatArray, values: FloatArray, lines: Iterable[style.LineStyle]) -> None:
     """Draw each column of values (k, c) over x (k,), in its style."""
     for column, line in zip(values.T, lines, strict=True):
         axes.plot(x, column, **line)
+
+
+def joints(axes: "style.Axes", t: FloatArray, values: FloatArray, chosen: Iterable[int]) -> None:
+    """Draw values (k, n) of the chosen joints over time (k,), in the styles and by the names of joints."""
+    for i in chosen:
+        axes.plot(t, values[:, i], **style.curve(i, f"$q_{{{i + 1}}}$"))
+
+
+Curve = tuple[
+    npt.NDArray[Any], npt.NDArray[Any], style.LineStyle
+]  # abscissa (k,), values (k,), and their style
+
+
+def errors(axes: "style.Axes", curves: Iterable[Curve], least: float = 0.0, **names: str) -> None:
+    """Draw errors over time on a logarithmic scale, those below the least at it.
+
+    names : of the abscissa and the ordinate.
+    """
+    for t, values, line in curves:
+        axes.plot(t, np.maximum(values, least), **line)
+    style.log_scale(axes)
+    axes.set(**{"xlabel": "time (s)"} | names)

@@ -240,22 +240,17 @@ def view_lines(names: Iterable[str]) -> list[LineStyle]:
     return [line(*_VIEWS[v % len(_VIEWS)], label=f"{name} camera") for v, name in enumerate(names)]
 
 
-def separator(views: int) -> str:
-    """Text between a camera and what else a title says: panels of more than two in a row are narrow."""
-    return "\n" if views > 2 else ", "
-
-
 def zero_line(axes: "Axes") -> None:
     """Draw the line at which a margin is used up."""
     axes.axhline(0.0, color=BLACK, linewidth=0.6)
 
 
-def image_axes(axes: "Axes", title: str, pixels: FloatArray | None = None, margin: float = 0.06) -> None:
+def image_axes(axes: "Axes", pixels: FloatArray | None = None, margin: float = 0.06) -> None:
     """Axes of an image, v down, that widen to fill their panel.
 
     They show all pixels (…, 2), by default all that is drawn so far, with a margin.
     """
-    axes.set(title=title, xlabel="u (px)", ylabel="v (px)", label=_IMAGE)
+    axes.set(xlabel="u (px)", ylabel="v (px)", label=_IMAGE)
     points = axes.dataLim.get_points() if pixels is None else pixels.reshape(-1, 2)
     points = points[np.isfinite(points).all(axis=1)]
     low, high = points.min(axis=0), points.max(axis=0)

@@ -210,7 +210,7 @@ def _draw(data: Data, figure: "style.Figure") -> None:
         figure, (len(views), 2, 2), (1.15, 1.0, 0.9)
     )
     for axes, view in zip(cameras, views, strict=True):
-        _arrows(axes, data, view, style.separator(len(views)))
+        _arrows(axes, data, view)
     _histogram(residuals, data)
     _poses(poses, data)
     _excitation(joints, data)
@@ -223,7 +223,7 @@ def _draw(data: Data, figure: "style.Figure") -> None:
     style.legend_below(figure, 3, notes)
 
 
-def _arrows(axes: "style.Axes", data: Data, view: str, separator: str) -> None:
+def _arrows(axes: "style.Axes", data: Data, view: str) -> None:
     """Draw residuals as arrows in one image, magnified, and the observations that were rejected."""
     used, rejected = data[f"seen_{view}"], {kind: data[f"rejected_{kind}_{view}"] for kind in _KINDS}
     count = sum(map(len, rejected.values()))
@@ -235,8 +235,8 @@ def _arrows(axes: "style.Axes", data: Data, view: str, separator: str) -> None:
     for kind, positions in rejected.items():
         if len(positions):
             axes.plot(*positions.T, **_LEFT_OUT[kind], markersize=size, markeredgewidth=0.9)
-    title = f"{view}: {len(used):,} observations{separator}{count:,} rejected"
-    style.image_axes(axes, title, np.concatenate([used, used + arrows, *rejected.values()]))
+    axes.set_title(f"{view}: {len(used):,} observations\n{count:,} rejected")
+    style.image_axes(axes, np.concatenate([used, used + arrows, *rejected.values()]))
 
 
 def _histogram(axes: "style.Axes", data: Data) -> None:

@@ -164,7 +164,7 @@ def _enlarge(axes: "style.Axes", t: FloatArray, steps: FloatArray, chosen: list[
     if not 0.0 < _HIDES * half < float(largest[-1]):
         return
     inset = axes.inset_axes((0.52, 0.56, 0.45, 0.38))
-    panels.columns(inset, t, steps[:, chosen], map(style.curve, chosen))
+    panels.joints(inset, t, steps, chosen)
     inset.set(xlim=axes.get_xlim(), ylim=(-half, half))
     inset.tick_params(labelsize=6.5)
     inset.text(0.97, 0.93, "enlarged", ha="right", va="top", fontsize=6.5, transform=inset.transAxes)
@@ -202,8 +202,8 @@ def _draw_joints(data: Data, figure: "style.Figure") -> None:
     for (joints, steps), (chosen, unit) in zip(axes.reshape(-1, 2, 2), kinds, strict=True):
         for panel, panel_below, (name, limited) in zip(joints, steps, _WAYS, strict=True):
             t = data[f"t_s_{name}"]
-            panels.columns(panel, t, data[f"q_{name}"][:, chosen], map(style.curve, chosen))
-            panels.columns(panel_below, t[:-1], data[f"step_{name}"][:, chosen], map(style.curve, chosen))
+            panels.joints(panel, t, data[f"q_{name}"], chosen)
+            panels.joints(panel_below, t[:-1], data[f"step_{name}"], chosen)
             if limited and unit == "deg":
                 for bound in (-limit, limit):
                     panel_below.axhline(bound, **_LIMIT)
@@ -217,8 +217,7 @@ def _draw_joints(data: Data, figure: "style.Figure") -> None:
     for column, heading in zip(axes.T, ("no limit", f"{limit:g}° per step"), strict=True):
         column[0].set_title(f"directTHREE, {heading}")
         column[-1].set_xlabel("time (s)")
-    lines = [style.curve(i, f"$q_{i + 1}$") for i in range(len(prismatic))]
-    style.legend_below(figure, min(len(lines) + 1, 8), [*lines, _LIMIT | {"label": "limit"}])
+    style.legend_below(figure, min(len(prismatic) + 1, 8), [_LIMIT | {"label": "limit"}])
 
 
 def _data_runs(report_data: Driven) -> Data:
@@ -255,16 +254,13 @@ def _draw_runs(data: Data, figure: "style.Figure") -> None:
     figure.set_figheight(4.4 * len(runs) + 0.5)
     rows = panels.rows(figure, [len(names), 3] * len(runs))
     units = "deg or mm" if slides.any() and not slides.all() else "mm" if slides.all() else "deg"
-    lines = [style.curve(i, f"$q_{{{i + 1}}}$") for i in range(len(slides))]
     for name, images, (error, joints, commands) in zip(runs, rows[::2], rows[1::2], strict=True):
         panels.images(images, [panels.Run(data[f"s_{name}"], panels.PATH)], data[f"s_star_{name}"])
         panels.cameras(images, names, str(data[f"verdict_{name}"]))
         t = data[f"t_s_{name}"]
-        error.plot(t, data[f"error_px_{name}"], **style.line(style.BLACK))
-        style.log_scale(error)
-        panels.columns(joints, t, data[f"q_{name}"], lines)
-        panels.columns(commands, t[:-1], data[f"q_dot_{name}"], lines)
-        ordinates = "error (px)", f"joint ({units})", f"velocity ({units} per s)"
-        for panel, what in zip((error, joints, commands), ordinates, strict=True):
-            panel.set(ylabel=what, xlabel="time (s)")
+        panels.errors(error, [(t, data[f"error_px_{name}"], style.line(style.BLACK))], ylabel="error (px)")
+        panels.joints(joints, t, data[f"q_{name}"], range(len(slides)))
+        panels.joints(commands, t[:-1], data[f"q_dot_{name}"], range(len(slides)))
+        joints.set(ylabel=f"joint ({units})", xlabel="time (s)")
+        commands.set(ylabel=f"velocity ({units} per s)", xlabel="time (s)")
     style.legend_below(figure, 8)

@@ -137,14 +137,15 @@ def _draw_errors(data: Data, figure: "style.Figure") -> None:
     """One panel a camera; u solid, v dashed, the centre thick, if it is known."""
     t, numbers, names = data["t_s"], data["marker"], data["view"]
     axes = figure.subplots(1, len(names), sharey=True, squeeze=False)[0]
-    for view, (panel, name) in enumerate(zip(axes, names, strict=True)):
+    for view, panel in enumerate(axes):
         for k, number in enumerate(numbers):
             every = {"markevery": (k * len(t) // 60, max(1, len(t) // 12))}
             line = style.curve(k, f"marker {number}", marker=True) | _MARKER | every
             _coordinates(panel, t, data["e"][:, view, k], line)
         if "center_e" in data:
             _coordinates(panel, t, data["center_e"][:, view], _CENTER_ERROR | {"label": "centre"})
-        panel.set(title=f"{name} camera{style.separator(len(names))}{data['law']}", xlabel="time (s)")
+        panel.set_xlabel("time (s)")
+    panels.titles(axes, names, str(data["law"]))
     axes[0].set_ylabel("image error $s - s_*$ (px)")
     style.legend_below(figure, min(len(numbers) + 3, 8), _COORDINATES)
 
@@ -223,24 +224,24 @@ def _draw_overview(data: Data, figure: "style.Figure") -> None:
         panel.plot(*data["center"][:, view].T, **_CENTER)
     panels.cameras(images, names)
     _control_errors(errors[0], data)
+    curves: list[panels.Curve] = []
     for law, line in lines.items():
         e, hidden = data[f"image_error_{law}"], data[f"hidden_{law}"].any(axis=1)
         t = data["period_s"] * np.arange(len(e))
-        errors[1].plot(t, np.where(hidden, e, np.nan), **style.HIDDEN)
-        errors[1].plot(t, e, **line)
-    style.log_scale(errors[1])
-    errors[1].set(title="image errors, both laws", ylabel="rms (px)", xlabel="time (s)")
+        curves += [(t, np.where(hidden, e, np.nan), style.HIDDEN), (t, e, line)]
+    panels.errors(errors[1], curves, title="image errors, both laws", ylabel="rms (px)")
     style.legend_below(figure, 2)
 
 
 def _control_errors(axes: "style.Axes", data: Data) -> None:
     """Draw the errors of the direct law in % of their start, with a legend above them."""
+    curves = []
     for index, (name, label) in enumerate(_ERRORS.items()):
         values = data[f"{name}_percent"]
-        legend = label + " near 0" * bool(np.isnan(values[0]))
-        axes.plot(data["period_s"] * np.arange(len(values)), values, **style.curve(index, legend))
-    style.log_scale(axes)
-    axes.set(ylabel="error (% of its start)", ylim=_PERCENT, xlabel="time (s)")
+        line = style.curve(index, label + " near 0" * bool(np.isnan(values[0])))
+        curves.append((data["period_s"] * np.arange(len(values)), values, line))
+    panels.errors(axes, curves, ylabel="error (% of its start)")
+    axes.set_ylim(_PERCENT)
     axes.set_title(f"control errors, {title_of(DIRECT[0])}", pad=_LEGEND_ROOM)
     axes.legend(
         handlelength=1.5, columnspacing=1.0, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=len(_ERRORS)
@@ -449,19 +450,23 @@ def _draw_incidences(data: Data, figure: "style.Figure") -> None:
     style.legend_below(figure, 4)
 
 
+def _pixel_errors(data: Data) -> dict[str, FloatArray]:
+    """Errors by the name of their run, px."""
+    return {name.removeprefix("px_"): data[name] for name in data if name.startswith("px_")}
+
+
 def _errors_of_runs(panel: "style.Axes", data: Data, k: int) -> None:
     """Draw the error of an incidence over time, a curve for each run, on the scale of all incidences."""
-    runs = {name.removeprefix("px_"): data[name] for name in data if name.startswith("px_")}
+    runs = _pixel_errors(data)
+    curves = [
+        (data[f"t_s_{name}"], errors[:, k], style.curve(i, title(name)))
+        for i, (name, errors) in enumerate(runs.items())
+        if np.isfinite(errors[:, k]).any()
+    ]
+    panels.errors(panel, curves, _LEAST_PX, ylabel="error (px at one px of noise)")
     every = np.concatenate([errors.ravel() for errors in runs.values()])
     every = np.maximum(every[np.isfinite(every)], _LEAST_PX)
-    for i, (name, errors) in enumerate(runs.items()):
-        if np.isfinite(errors[:, k]).any():
-            panel.plot(
-                data[f"t_s_{name}"], np.maximum(errors[:, k], _LEAST_PX), **style.curve(i, title(name))
-            )
-    style.log_scale(panel)
-    panel.set(ylim=(0.5 * every.min(initial=1.0), 2.0 * every.max(initial=1.0)))
-    panel.set(xlabel="time (s)", ylabel="error (px at one px of noise)")
+    panel.set_ylim(0.5 * every.min(initial=1.0), 2.0 * every.max(initial=1.0))
 
 
 def _within(data: Data, k: int) -> str:
@@ -502,11 +507,11 @@ def _data_sequence(report_data: Driven) -> Data:
 def _draw_sequence(data: Data, figure: "style.Figure") -> None:
     """A curve for each motion."""
     panel = figure.subplots()
-    for i, name in enumerate(name.removeprefix("px_") for name in data if name.startswith("px_")):
-        error = np.maximum(data[f"px_{name}"], _LEAST_PX)
-        panel.plot(data[f"t_s_{name}"], error, **style.curve(i, name.split("/")[0]))
-    style.log_scale(panel)
-    panel.set(xlabel="time of motion (s)", ylabel="error (px)")
+    curves = [
+        (data[f"t_s_{name}"], error, style.curve(i, name.split("/")[0]))
+        for i, (name, error) in enumerate(_pixel_errors(data).items())
+    ]
+    panels.errors(panel, curves, _LEAST_PX, xlabel="time of motion (s)", ylabel="error (px)")
     style.legend_below(figure, 3)
 
 

@@ -94,7 +94,8 @@ def _draw_partition(data: Data, figure: "style.Figure") -> None:
         style.face(panel, data["A"], _START, fill=True)
         for name in ends:
             style.face(panel, data[name], _TARGETS[name])
-        style.image_axes(panel, title)
+        panel.set_title(title)
+        style.image_axes(panel)
     arrow = {"arrowstyle": "->", "linewidth": 0.9}
     row[0].annotate("", data["center"][1], data["center"][0], arrowprops=arrow)
     style.legend_below(figure, 3)
@@ -156,10 +157,6 @@ def _draw_visibility(data: Data, figure: "style.Figure") -> None:
         _angle(turned, data["theta_deg"], margins, senses, data["theta_0_deg"][view])
         _translation(moved, data["tau_share"], data["tau_margin"][:, view], data["tau_0_share"][view])
     panels.cameras(rows[0], names)
-    if len(names) > 2:  # panels are narrow
-        for turned, moved in zip(*rows[1:], strict=True):
-            turned.set_title(turned.get_title().replace(" and ", ", "))
-            moved.set_xlabel(r"share of $\tau$ (1)")
     style.legend_below(figure, 3, [_END])
 
 
@@ -173,7 +170,7 @@ def _angle(
     """Margins (2, k) over angles (2, k), deg, in both senses, and the angles (2,) of no margin."""
     for theta, margin, line in zip(angles, margins, senses, strict=True):
         _margin(axes, theta, margin, line)
-    zeros_text = rf"$\theta_0^\pm$ = {' and '.join(f'{_signed(angle)}°' for angle in zeros)}"
+    zeros_text = rf"$\theta_0^\pm$ = {', '.join(f'{_signed(angle)}°' for angle in zeros)}"
     axes.set_title(zeros_text if np.isfinite(zeros).all() else "visibility never changes")
     periods = (zeros[:, None] + np.array([-360.0, 0.0, 360.0])).ravel()
     periods = periods[(periods >= angles.min()) & (periods <= angles.max())]
@@ -187,7 +184,7 @@ def _translation(axes: "style.Axes", share: FloatArray, margin: FloatArray, zero
     axes.plot([zero], [0.0], **_ZERO)
     zero_text = rf"$\tau_0$ = {_signed(zero, 2)} $\tau$"
     axes.set_title(zero_text if np.isfinite(zero) else "visibility never changes")
-    axes.set(xlim=(share[0], share[-1]), xlabel=r"translation as share of $\tau$ (1)")
+    axes.set(xlim=(share[0], share[-1]), xlabel=r"share of $\tau$ (1)")
 
 
 def _margin(
@@ -352,7 +349,8 @@ def _faces(axes: "style.Axes", data: Data) -> None:
     for j in visible:
         width = 1.8 if j in (visible[0], visible[-1]) else 1.0
         style.face(axes, faces[j], style.line(colormaps["cividis"](0.82 * sigma[j]), width=width))
-    style.image_axes(axes, f"from the {data.get('from', _MIDDLE)}, {data['profile']}", faces)
+    axes.set_title(f"from the {data.get('from', _MIDDLE)}, {data['profile']}")
+    style.image_axes(axes)
     place: Any = {"xytext": (0, 5), "textcoords": "offset points", "ha": "center", "va": "bottom"}
     paper = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.8}
     for corners, label in ((faces[0], "start"), (faces[-1], "goal")):
@@ -419,9 +417,9 @@ def _draw_path(data: Data, figure: "style.Figure") -> None:
     """Above the map of each camera with the path, below the shares and the margins along it."""
     names = data["view"]
     maps, (shares, margins) = panels.rows(figure, [len(names), 2], [1.5, 1.0])
-    for view, (panel, name) in enumerate(zip(maps, names, strict=True)):
+    for view, panel in enumerate(maps):
         _map(panel, data, view)
-        panel.set_title(f"{name} camera{style.separator(len(names))}{data['profile']} profile")
+    panels.titles(maps, names, f"{data['profile']} profile")
     panels.columns(shares, data["sigma"], data["mu"], _SHARES)
     panels.columns(margins, data["sigma"], data["along"], _MARGINS)
     shares.set(xlabel=_SIGMA, ylabel=_SHARE)
