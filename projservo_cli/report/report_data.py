@@ -15,7 +15,7 @@ import numpy.typing as npt
 from projservo_cli.calibration.joint_model import describe_curve
 from projservo_cli.findings import REFUSES, Finding, named, of_readings, told
 from projservo_cli.geometry.kinematics import project
-from projservo_cli.laws import IMAGE_TRACK, POINT_LAWS, REGULATE, TRACK, law_and_mode, title_of
+from projservo_cli.laws import IMAGE_TRACK, REGULATE, TRACK, law_and_mode, title_of
 from projservo_cli.metric.frame import Metric
 from projservo_cli.planning.margins import CONSTRAINTS, OF_MOTION
 from projservo_cli.records import (
@@ -210,7 +210,8 @@ class FigureSpec:
     shares: bool = False  # whether it shows shares of translation and rotations
     modes: bool = False  # whether it compares runs that follow the plan with others
     goal: bool = False  # whether it needs a known goal pose
-    shows: str = ""  # what is not in every run, by its name in ``_SHOWN``
+    # Whether a run has what is not in every run and is shown here, and why else the figure is left out.
+    shows: tuple[Callable[[Any], bool], str] | None = None
     task: bool = True  # whether it needs a task; else a calibration with its observations is enough
     metric: bool = False  # whether it needs the calibration in metres
 
@@ -224,7 +225,7 @@ class FigureSpec:
     @property
     def optional(self) -> bool:
         """Whether it is left out without a word where a run has nothing to show in it."""
-        return bool(self.shows)
+        return self.shows is not None
 
     def drawn(self, data: Data) -> "Figure":
         """The figure of its data."""
@@ -234,8 +235,8 @@ class FigureSpec:
         """Return the reason why the figure cannot be drawn; empty if it can."""
         if not self.task:
             return report_data.no_metric if self.metric else ""
-        if self.shows and isinstance(report_data, Driven | ReportData):
-            shown, why = _SHOWN[self.shows]
+        if self.shows is not None and isinstance(report_data, Driven | ReportData):
+            shown, why = self.shows
             return "" if shown(report_data) else why
         if isinstance(report_data, Driven):
             return report_data.lacks
@@ -272,28 +273,6 @@ class FigureSpec:
         ]
 
 
-def _any_has(field: str) -> Callable[["Driven | ReportData"], bool]:
-    """Return whether some run has an array."""
-    return lambda report_data: any(getattr(trace, field) is not None for trace in report_data.traces.values())
-
-
-def _of_other_laws(report_data: "Driven | ReportData") -> bool:
-    """Whether runs are of laws that are not in the paper; those of a sequence have a figure of their own."""
-    others = {*moved(report_data)} - {*DIRECT, *POINT_LAWS}
-    return bool(others) and not any("/" in name for name in others)
-
-
-# What figures show that is not in every run: whether it is, and why else it is left out.
-_SHOWN: dict[str, tuple[Callable[[Any], bool], str]] = {
-    "frames": (_any_has("frame_index"), "the robot shows no frames"),
-    "incidences": (_any_has("feature_s"), "the goal is a whole pose"),
-    "sequence": (
-        lambda found: isinstance(found, Driven) and any("/" in name for name in found.traces),
-        "the task is one motion",
-    ),
-    "runs": (_of_other_laws, "all runs are of laws of the paper"),
-    "object": (lambda found: found.plan.s_object_taught is not None, "no object carries the goal"),
-}
 REGISTER: dict[str, FigureSpec] = {}
 _Draw = Callable[[Data, "Figure"], None]
 

@@ -2,9 +2,11 @@
 
 import numpy as np
 
+from projservo_cli.laws import POINT_LAWS
 from projservo_cli.records import FloatArray, Trace
 from projservo_cli.report import panels, style
 from projservo_cli.report.report_data import (
+    DIRECT,
     Data,
     Driven,
     ReportData,
@@ -239,12 +241,18 @@ def _data_runs(report_data: Driven) -> Data:
     return result
 
 
+def _of_other_laws(report_data: Driven | ReportData) -> bool:
+    """Whether runs are of laws that are not in the paper; those of a sequence have a figure of their own."""
+    others = {*moved(report_data)} - {*DIRECT, *POINT_LAWS}
+    return bool(others) and not any("/" in name for name in others)
+
+
 @registered(
     "fig21_runs",
     "Every run: images, error, joints and commands",
     "not in the paper",
     _data_runs,
-    shows="runs",
+    shows=(_of_other_laws, "all runs are of laws of the paper"),
     alt="A row for each run: the paths of the markers in the camera images, and the error that decides "
     "convergence, the joints and the commanded joint velocities over time.",
 )

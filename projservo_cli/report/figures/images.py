@@ -287,10 +287,14 @@ def frames_of(
     return films
 
 
-def _shown_run(report_data: Driven | ReportData, field: str) -> tuple[str, Trace]:
-    """Name and trace of the first direct law, else of the first, of the runs that have an array."""
+def _runs_with(report_data: Driven | ReportData, field: str) -> list[tuple[str, Trace]]:
+    """Names and traces of the runs that have an array, first those of the direct laws."""
     runs = [run for run in report_data.traces.items() if getattr(run[1], field) is not None]
-    return next((run for run in runs if run[0] in BODY_LAWS), runs[0])
+    return sorted(runs, key=lambda run: run[0] not in BODY_LAWS)
+
+
+def _filmed(report_data: Driven | ReportData) -> bool:
+    return bool(_runs_with(report_data, "frame_index"))
 
 
 def _data_frames(report_data: Driven | ReportData) -> Data:
@@ -299,7 +303,7 @@ def _data_frames(report_data: Driven | ReportData) -> Data:
     The run is one of those with frames.
     """
     order = cyclic_order(report_data.plan.A)
-    name, trace = _shown_run(report_data, "frame_index")
+    name, trace = _runs_with(report_data, "frame_index")[0]
     assert trace.frame_index is not None
     assert trace.frame_s is not None
     half = np.abs(trace.image_error[trace.frame_index] - 0.5 * trace.image_error[0])
@@ -332,7 +336,7 @@ def with_halo(axes: "style.Axes") -> None:
     "Images of the cameras at the start, in the middle and at the end",
     "not in the paper",
     _data_frames,
-    shows="frames",
+    shows=(_filmed, "the robot shows no frames"),
     alt="A row for each camera, with its image at the start, in the middle and at the end. Drawn over "
     "them are the markers that were found, the face with the paths of its markers so far, and the goal.",
 )
@@ -384,7 +388,7 @@ def _data_incidences(report_data: ReportData | Driven) -> Data:
 
     Motions of a sequence have incidences of their own: what a run does not ask for is NaN.
     """
-    name, shown = _shown_run(report_data, "feature_s")
+    name, shown = _runs_with(report_data, "feature_s")[0]
     result: Data = {
         "run": np.array(title(name)),
         "free_dof": np.array(-1 if shown.free_dof is None else shown.free_dof),
@@ -409,12 +413,16 @@ def _data_incidences(report_data: ReportData | Driven) -> Data:
     return result
 
 
+def _of_features(report_data: Driven | ReportData) -> bool:
+    return bool(_runs_with(report_data, "feature_s"))
+
+
 @registered(
     "fig19_incidences",
     "Incidences in the images, and their errors",
     "no figure",
     _data_incidences,
-    shows="incidences",
+    shows=(_of_features, "the goal is a whole pose"),
     alt="Above, for each camera: the features of the tool at the start and at the end of a run, those of the "
     "scene, and how the motions that are left free move the face. Below, for each incidence: its error over "
     "time on a logarithmic scale, a curve for each run.",
@@ -495,13 +503,17 @@ def _data_sequence(report_data: Driven) -> Data:
     return result
 
 
+def _of_motions(report_data: Driven | ReportData) -> bool:
+    return isinstance(report_data, Driven) and any("/" in name for name in report_data.traces)
+
+
 @registered(
     "fig20_sequence",
     "Image errors of the motions of a sequence",
     "no figure",
     _data_sequence,
     height=3.2,
-    shows="sequence",
+    shows=(_of_motions, "the task is one motion"),
     alt="The image error of each motion over time, one after the other, on a logarithmic scale.",
 )
 def _draw_sequence(data: Data, figure: "style.Figure") -> None:
@@ -540,13 +552,17 @@ def _data_object(report_data: ReportData | Driven) -> Data:
     }
 
 
+def _carried(report_data: Driven | ReportData) -> bool:
+    return report_data.plan.s_object_taught is not None
+
+
 @registered(
     "fig22_object",
     "The object of the goal, and the goal carried along",
     "no figure",
     _data_object,
     height=4.2,
-    shows="object",
+    shows=(_carried, "no object carries the goal"),
     alt="For each camera: the tags of the object when the goal was taught and now, the displacement of each "
     "marker, and the face at the goal that was carried along.",
 )
