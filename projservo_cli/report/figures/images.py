@@ -212,24 +212,21 @@ def _draw_overview(data: Data, figure: "style.Figure") -> None:
     figure.set_figheight(rows * _IMAGE_WIDTH * aspect + 1.75 + 0.6 * (rows - 2) + _LEGEND_ROOM / 72.0)
     grid = figure.add_gridspec(rows, 2, width_ratios=(_IMAGE_WIDTH, _ERRORS_WIDTH))
     cells = [grid[:, 0]] if len(names) == 1 else [grid[view, 0] for view in range(rows)]
-    images = [figure.add_subplot(cells[0])]
-    errors = [figure.add_subplot(grid[0, 1])]
-    images += [figure.add_subplot(cell) for cell in cells[1:2]]
-    errors += [figure.add_subplot(grid[1:, 1])]
-    images += [figure.add_subplot(cell) for cell in cells[2:]]
+    images = [figure.add_subplot(cell) for cell in cells]
+    control, pixel = figure.add_subplot(grid[0, 1]), figure.add_subplot(grid[1:, 1])
     lines = {law: style.LAW_LINES[law] | {"label": str(data[f"verdict_{law}"])} for law in _OVERVIEW_LAWS}
     runs = [panels.Run(data[f"s_{law}"], line, data[f"hidden_{law}"]) for law, line in lines.items()]
     panels.images(images, runs[::-1], data["s_star"])
     for view, panel in enumerate(images):
         panel.plot(*data["center"][:, view].T, **_CENTER)
     panels.cameras(images, names)
-    _control_errors(errors[0], data)
+    _control_errors(control, data)
     curves: list[panels.Curve] = []
     for law, line in lines.items():
         e, hidden = data[f"image_error_{law}"], data[f"hidden_{law}"].any(axis=1)
         t = data["period_s"] * np.arange(len(e))
         curves += [(t, np.where(hidden, e, np.nan), style.HIDDEN), (t, e, line)]
-    panels.errors(errors[1], curves, title="image errors, both laws", ylabel="rms (px)")
+    panels.errors(pixel, curves, title="image errors, both laws", ylabel="rms (px)")
     style.legend_below(figure, 2)
 
 
