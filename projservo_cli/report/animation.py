@@ -400,22 +400,11 @@ def _frames(traces: Mapping[str, Trace], order: IntArray, sizes: FloatArray) -> 
         axes = figure.subplots(views, len(runs), squeeze=False, sharex=True, sharey=True)
         for column, (name, run) in zip(axes.T, runs.items(), strict=True):
             for view, (panel, camera) in enumerate(zip(column, run.view, strict=True)):
-                style.start_and_goal(panel, run.s[0, view, order], run.s_star[view, order], fill=False)
-                if run.feature_s_star is not None:
-                    panel.plot(*style.outlines(run.feature_s_star[:, :, view]).T, **OF_SCENE)
                 style.image_axes(panel, near, margin)
                 panel.set_title("" if view else f"{title(name)}\nrunning")
                 panel.set_ylabel("" if columns else f"{camera} camera\nv (px)")
                 panel.set_xlabel("u (px)" if view == views - 1 else "")
-            features = np.zeros((len(run.s), 0, 3, views, 2)) if run.feature_s is None else run.feature_s
-            parts = zip(
-                column,
-                run.s[:, :, order].swapaxes(0, 1),
-                run.self_occluded.T,
-                np.moveaxis(features, 3, 0),
-                strict=True,
-            )
-            columns.append([_Panel(*part) for part in parts])
+            columns.append([_Panel(panel, run, view, order) for view, panel in enumerate(column)])
             if (film := films[name]) is not None and run.frame_index is not None:
                 for panel, frames, extent in zip(columns[-1], film, sizes, strict=True):
                     panel.over(frames, run.frame_index, extent)
@@ -440,15 +429,23 @@ def _frames(traces: Mapping[str, Trace], order: IntArray, sizes: FloatArray) -> 
 
 
 class _Panel:
-    """Moving parts of one image under one law: paths (t, m, 2), a face, hidden (t,) or not, and features."""
+    """One image under one law: start and goal, and what moves: paths, a face, hidden or not, and features.
 
-    def __init__(self, axes: Any, s: FloatArray, hidden: BoolArray, features: FloatArray) -> None:
-        self.axes, self.s, self.hidden, self.features = axes, s, hidden, features  # (t, g, 3, 2)
+    order : the markers around the face.
+    """
+
+    def __init__(self, axes: Any, run: Trace, view: int, order: IntArray) -> None:
+        self.axes, self.s, self.hidden = axes, run.s[:, view, order], run.self_occluded[:, view]
+        self.features = np.zeros((len(run.s), 0, 3, 2))
+        style.start_and_goal(axes, self.s[0], run.s_star[view, order], fill=False)
+        if run.feature_s is not None and run.feature_s_star is not None:
+            self.features = run.feature_s[:, :, :, view]
+            axes.plot(*style.outlines(run.feature_s_star[:, :, view]).T, **OF_SCENE)
         self.behind, self.paths = (
-            [axes.plot([], [], **line)[0] for _ in s[0]] for line in (style.HIDDEN, _PATH)
+            [axes.plot([], [], **line)[0] for _ in order] for line in (style.HIDDEN, _PATH)
         )
         over = {"color": style.BLACK, "linewidth": 2.0, "zorder": 4}
-        over["label"] = OF_TOOL["label"] * bool(features.size)
+        over["label"] = OF_TOOL["label"] * bool(self.features.size)
         (self.outline,) = axes.plot([], [], **OF_TOOL | over)
         (self.face,) = axes.fill([0.0], [0.0], linewidth=1.2, edgecolor=style.BLACK, alpha=0.9, zorder=3)
         place = {"transform": axes.transAxes, "ha": "center", "va": "bottom"}
