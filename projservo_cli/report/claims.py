@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from projservo_cli.geometry.displacements import displacements, normalize_displacement, tangent_operator
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
 from projservo_cli.laws import title_of
 from projservo_cli.loop.verdicts import plateau_stretch
@@ -633,6 +634,29 @@ def _image_error(subject: _Subject) -> Iterator[Numbers]:
         count=rise.size,
         rise=rise.max(),
     )
+
+
+_TRIAL = 0.5  # rad or m, of a trial motion of one joint
+_SAME_OPERATOR = 1e-9  # share of an operator within which another is the same
+
+
+@_EQUATION.claim(
+    "A trial motion of a joint defines its operator",
+    "section 2, eqs. (2), (4), (5)",
+    "by homographies of trials by {trial:g} rad or m, operators are within {off:.1g} of those calibrated",
+    "equal to round-off",
+    lambda n: n.off <= _SAME_OPERATOR,
+)
+def _group_to_algebra(subject: _Subject) -> Iterator[Numbers]:
+    """Largest share by which operators of trial motions, known up to scale, are off."""
+    model, A = subject.data.calibrated, subject.data.plan.A
+    off = 0.0
+    for H_hat, slides in zip(model.H_hat_0, model.prismatic, strict=True):
+        H = displacements(H_hat[None], np.array([slides]), np.array([[_TRIAL]]))[0, 0]
+        up_to_scale = normalize_displacement(-2.0 * H, A, model.a_inf)
+        found = tangent_operator(up_to_scale, _TRIAL, prismatic=bool(slides))
+        off = max(off, float(np.linalg.norm(found - H_hat) / np.linalg.norm(H_hat)))
+    yield Numbers(trial=_TRIAL, off=off)
 
 
 _EQUAL_M = 1e-9  # both sides of (22) agree where the centre is moved to within this of the same place

@@ -91,6 +91,15 @@ def test_image_errors_are_held_against_an_exponential_and_the_least_before():
         assert (int(many), int(most), holds) == monotone
 
 
+def test_a_trial_motion_defines_its_operator_in_any_calibration():
+    """By the operators of the run to round-off; not by one that is no tangent of a group."""
+    material = case()[2]
+    assert measured("A trial motion")[1]
+    model = material.calibrated
+    bent = model._replace(H_hat_0=model.H_hat_0 + 1e-3 * np.eye(4))
+    assert measured("A trial motion", dataclasses.replace(material, calibrated=bent))[1] is False
+
+
 def on_plateau(error, k, window):
     """Whether a run whose last instant is k ends so."""
     log = new_log(6, 4, len(error), 5)
