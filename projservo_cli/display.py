@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from projservo_cli.findings import Finding
-from projservo_cli.records import FARTHEST_M, TWO_TURNS, VIEWS, FloatArray, InputError
+from projservo_cli.records import FARTHEST_M, TWO_TURNS, VIEWS, FloatArray, InputError, flat_fields
 from projservo_cli.result_hashes import File
 
 _WIDTH = 100  # maximum length of a line, characters
@@ -67,7 +67,7 @@ class Displayable(Printed):
     def coordinates(self) -> dict[str, Any]:
         """Return coordinates of dimensions, by their names."""
         sizes: dict[str, int] = {}
-        for field in dataclasses.fields(self):  # type: ignore[arg-type]  # subclasses are dataclasses
+        for field in flat_fields(type(self)):
             value = getattr(self, field.name)
             if value is not None and "dims" in field.metadata:
                 sizes |= dict(zip(field.metadata["dims"], np.shape(value), strict=True))

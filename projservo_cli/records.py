@@ -6,9 +6,10 @@ knows how it is stored.
 """
 
 import math
-from collections.abc import Iterable
-from dataclasses import dataclass, field, fields, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import MISSING, Field, dataclass, field, fields, replace
+from functools import cache
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -97,10 +98,112 @@ def _by_view(about: str, **default: Any) -> Any:
     return field(metadata={"units": "1", "about": about, "by_view": True}, **default)
 
 
+_Found = TypeVar("_Found")
+
+
+def _kept(function: Callable[[Any], _Found]) -> Callable[[Any], _Found]:
+    """Keep what a function finds of each class, which mypy takes for unhashable."""
+    return cache(function)
+
+
+class Part:
+    """Base of a part of a record, whose fields stand among those of the record in files and JSON."""
+
+
+def part_of(entry: "Field[Any]") -> type[Part] | None:
+    """Kind of the part that a field holds; None of a field of another type."""
+    kinds = (entry.type, *get_args(entry.type))
+    return next((kind for kind in kinds if isinstance(kind, type) and issubclass(kind, Part)), None)
+
+
+def is_optional(entry: "Field[Any]") -> bool:
+    """Tell whether a field is None where there is none."""
+    return type(None) in get_args(entry.type)
+
+
+def has_default(entry: "Field[Any]") -> bool:
+    """Tell whether a field has a default."""
+    return entry.default is not MISSING
+
+
+@_kept
+def flat_fields(kind: Any) -> tuple["Field[Any]", ...]:
+    """Fields of a kind of record as files have them: those of each part in its place."""
+    found: list[Field[Any]] = []
+    for entry in fields(kind):
+        part = part_of(entry)
+        found += [entry] if part is None else flat_fields(part)
+    return tuple(found)
+
+
+@_kept
+def optional_names(kind: Any) -> frozenset[str]:
+    """Names of the fields of those parts of a kind of record that may be absent."""
+    parts = [part_of(entry) for entry in fields(kind) if is_optional(entry)]
+    return frozenset(entry.name for part in parts if part for entry in flat_fields(part))
+
+
+@_kept
+def _places(kind: Any) -> dict[str, str]:
+    """Names that parts of a kind of record have, each with that of the field that holds the part."""
+    found: dict[str, str] = {}
+    for entry in fields(kind):
+        if (part := part_of(entry)) is not None:
+            names = {*dir(part), *(inner.name for inner in flat_fields(part))}
+            found |= {name: entry.name for name in names if not name.startswith("_")}
+    return found
+
+
+class Composite:
+    """Base of a record of parts: what these have are attributes of the record, too."""
+
+    def __getattr__(self, name: str) -> Any:
+        """What a part has by a name; of an absent part the default of the field, or None."""
+        place = _places(type(self)).get(name)
+        if place is None:
+            raise AttributeError(f"{type(self).__name__} has no {name}")
+        if (part := getattr(self, place)) is not None:
+            return getattr(part, name)
+        defaults = (entry.default for entry in flat_fields(type(self)) if entry.name == name)
+        default = next(defaults, None)
+        return None if default is MISSING else default
+
+    def __dir__(self) -> Iterable[str]:
+        return sorted({*super().__dir__(), *_places(type(self))})
+
+
+_Record = TypeVar("_Record")
+
+
+def composed(kind: Any, values: Mapping[str, Any]) -> Any:
+    """Make a record of values of its flat fields; an optional part is absent without a required one."""
+    own: dict[str, Any] = {}
+    for entry in fields(kind):
+        part = part_of(entry)
+        if part is None and entry.name in values:
+            own[entry.name] = values[entry.name]
+        elif part is not None:
+            needed = (one.name for one in flat_fields(part) if not (is_optional(one) or has_default(one)))
+            there = not is_optional(entry) or any(values.get(name) is not None for name in needed)
+            own[entry.name] = composed(part, values) if there else None
+    return kind(**own)
+
+
+def changed(record: _Record, **values: Any) -> _Record:
+    """Return a record with other values of some fields, its own or those of the parts that it has."""
+    own: dict[str, Any] = {}
+    of_parts: dict[str, dict[str, Any]] = {}
+    for name, value in values.items():
+        place = _places(type(record)).get(name)
+        (own if place is None else of_parts.setdefault(place, {}))[name] = value
+    own |= {place: replace(getattr(record, place), **inner) for place, inner in of_parts.items()}
+    return replace(record, **own)  # type: ignore[type-var]  # records are dataclasses
+
+
 def scalars_of(record: Any) -> dict[str, Any]:
     """All fields of a record but its arrays, by their names in files and JSON."""
     found: dict[str, Any] = {}
-    for entry in fields(record):
+    for entry in flat_fields(type(record)):
         value = getattr(record, entry.name)
         if "by_view" in entry.metadata:
             names = (f"{entry.name}_{view}" for view in record.view)
@@ -663,11 +766,15 @@ def in_sense(theta_r: float, theta_p: float, q_hat: FloatArray) -> FloatArray:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class PlannedMotion:
+class PlannedMotion(Part):
     """Samples of a planned motion, and their margins."""
 
     path_parameter: FloatArray = _array("sample", about="path parameter from 0 to 1")
     time: FloatArray = _array("sample", "s", "time of each sample; NaN if the plan has no duration")
+    duration: float | None = _scalar(
+        "s",
+        "duration, as configured or at the joint-speed limit; none without a limit, or if no joints follow",
+    )
     mu: FloatArray = _array(
         "sample part", about="fractions of t, r, p that are done, NaN in the profile joint_space"
     )
@@ -693,7 +800,7 @@ class PlannedMotion:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class TaskPartition:
+class TaskPartition(Part):
     """A reaching task as a translation and two rotations, from images of start and goal, [RH00] section 4."""
 
     s_start: FloatArray = _array("view marker xy", "px", "images at the start")
@@ -710,6 +817,20 @@ class TaskPartition:
     q_start: FloatArray = _array("joint", "rad or m", "joint readings at the start")
     q_hat: FloatArray = _array("part joint", about="joint motions t, r, p at the start")
     H_hat: FloatArray = _array("part row coordinate", about="operators t, r, p at the start")
+    tau: float = _scalar(about="amplitude of the translation, unit-norm kernel of (8)")
+    theta_r: float = _scalar("rad", "angle onto the target plane, in the sense chosen")
+    theta_p: float = _scalar("rad", "angle within the plane")
+    theta_s: float = _scalar("rad", "angle of both rotations together")
+
+    def rotation_sense(self) -> FloatArray:
+        """Joint motions (2, n) of the rotations r and p in the sense they are planned."""
+        return in_sense(self.theta_r, self.theta_p, self.q_hat[1:3])
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FaceVisibility(Part):
+    """Where each view sees the face by translation and rotation, and both senses of the latter."""
+
     optical_center: FloatArray = _array("view coordinate", about="optical centres")
     tau_0: FloatArray = _array("view", about="translation at which visibility changes")
     theta_0: FloatArray = _array("view solution", "rad", "angles at which visibility changes")
@@ -717,23 +838,26 @@ class TaskPartition:
     sense_margin: FloatArray = _array(
         "solution view", about="minimum margin along each sense, 1 at the start"
     )
+    tau_limit: float = _scalar(
+        about="minimum visibility_fraction·tau_0 ahead of the face, infinite if there is none"
+    )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class JointSpaceSearch:
+class JointSpaceSearch(Part):
     """A search through joint space: its numbers, trees and required margins; none in other profiles."""
 
-    n_goal_configurations: int | None = _optional_scalar(
+    n_goal_configurations: int = _scalar(
         about="number of goal configurations within the limits; none but in the profile joint_space"
     )
-    n_search_samples: int | None = _optional_scalar(
+    n_search_samples: int = _scalar(
         about="number of samples of the search; none but in the profile joint_space"
     )
-    n_goals_tried: int | None = _optional_scalar(
+    n_goals_tried: int = _scalar(
         about="number of goal configurations tried, nearest in time; none but in the profile joint_space"
     )
-    seed: int | None = _optional_scalar(about="seed of the search; none but in the profile joint_space")
-    tree_nodes: int | None = _optional_scalar(
+    seed: int = _scalar(about="seed of the search; none but in the profile joint_space")
+    tree_nodes: int = _scalar(
         about="number of nodes of both search trees, of which the first are stored; none but in the "
         "profile joint_space"
     )
@@ -759,35 +883,29 @@ class JointSpaceSearch:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class CarriedByObject:
+class CarriedByObject(Part):
     """Object that the goal was taught on, where it is now, and the goal carried along; none without one."""
 
-    object_name: str | None = _optional_scalar(about="name of the object that carries the goal")
+    object_name: str = _scalar(about="name of the object that carries the goal")
     object_shift_mm: float | None = _optional_scalar(
         "mm", "motion of its middle since the goal was taught; none if no length is known"
     )
     object_angle_deg: float | None = _optional_scalar(
         "deg", "its rotation since; none if the joints do not determine the metric"
     )
-    object_shift_px: float | None = _optional_scalar(
-        "px", "motion of its images since, rms per marker and view"
-    )
+    object_shift_px: float = _scalar("px", "motion of its images since, rms per marker and view")
     goal_deviation_mm: float | None = _optional_scalar(
         "mm", "deviation of the carried goal, rms; none if no length is known"
     )
     goal_deviation_deg: float | None = _optional_scalar(
         "deg", "deviation of its rotation; none if the joints do not determine the metric"
     )
-    goal_deviation_px: float | None = _optional_scalar(
-        "px", "deviation of its images, rms per marker and view"
-    )
-    object_marker: IntArray | None = _optional_array(
-        "object_marker", about="numbers of the markers of the object"
-    )
+    goal_deviation_px: float = _scalar("px", "deviation of its images, rms per marker and view")
+    object_marker: IntArray = _array("object_marker", about="numbers of the markers of the object")
     object_left_out: str | None = _optional_scalar(
         about="numbers of its markers that were off by themselves in a look, and left out of it"
     )
-    s_object: FloatArray | None = _optional_array(
+    s_object: FloatArray = _array(
         "view object_marker xy", "px", "images of these when it was planned, NaN if unseen"
     )
     s_object_taught: FloatArray | None = _optional_array(
@@ -796,15 +914,13 @@ class CarriedByObject:
     sigma_object: FloatArray | None = _optional_array(
         "view object_marker", "px", "standard deviation of a coordinate of these, NaN if unknown"
     )
-    s_carried: FloatArray | None = _optional_array(
+    s_carried: FloatArray = _array(
         "view observed xy", "px", "images of all markers of the body at the carried goal"
     )
 
     @property
     def object_words(self) -> str:
-        """How far the object has moved and how well its goal is known, in words; empty without one."""
-        if self.object_name is None:
-            return ""
+        """How far the object has moved and how well its goal is known, in words."""
         shift = [
             f"{number:.3g} {unit}"
             for number, unit in (
@@ -831,7 +947,24 @@ class CarriedByObject:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Plan(CarriedByObject, JointSpaceSearch, TaskPartition, PlannedMotion):
+class GoalOfIncidences(Part):
+    """Goal that was chosen of those that incidences leave open; none for the whole pose."""
+
+    incidences: tuple[str, ...] = _scalar(
+        about="incidences that are to hold at the goal; none for the whole pose", default=()
+    )
+    free_dof: int = _scalar(
+        about="number of joint motions at the goal that keep all incidences; none for the whole pose"
+    )
+    s_goal: FloatArray = _array(
+        "view observed xy",
+        "px",
+        "images of all markers of the body at the goal that was chosen, of those that incidences leave open",
+    )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Plan(Composite):
     """A reaching task as a translation and two rotations, and the motion planned for it.
 
     Everything comes from the calibration and the start and goal images. Amplitudes are per view
@@ -849,42 +982,22 @@ class Plan(CarriedByObject, JointSpaceSearch, TaskPartition, PlannedMotion):
         about="what holds or is off: code, severity, subject, amount, deviation, limit, unit, effect",
         default=(),
     )
-    tau: float = _scalar(about="amplitude of the translation, unit-norm kernel of (8)")
-    theta_r: float = _scalar("rad", "angle onto the target plane, in the sense chosen")
-    theta_p: float = _scalar("rad", "angle within the plane")
-    theta_s: float = _scalar("rad", "angle of both rotations together")
     constraint: str = _scalar(
         about="constraint with the smallest margin, as a fraction of its margin at the ends"
     )
-    duration: float | None = _scalar(
-        "s",
-        "duration, as configured or at the joint-speed limit; none without a limit, or if no joints follow",
-    )
-    tau_limit: float = _scalar(
-        about="minimum visibility_fraction·tau_0 ahead of the face, infinite if there is none"
-    )
     rejected_profiles: tuple[str, ...] = _scalar(
         about="profiles that auto rejected, each with the reason", default=()
-    )
-    incidences: tuple[str, ...] = _scalar(
-        about="incidences that are to hold at the goal; none for the whole pose", default=()
-    )
-    free_dof: int | None = _optional_scalar(
-        about="number of joint motions at the goal that keep all incidences; none for the whole pose"
-    )
-    s_goal: FloatArray | None = _optional_array(
-        "view observed xy",
-        "px",
-        "images of all markers of the body at the goal that was chosen, of those that incidences leave open",
     )
     relaxed_constraints: tuple[str, ...] = _scalar(
         about="constraints relaxed at the start and the goal, which have smaller margins themselves",
         default=(),
     )
-
-    def rotation_sense(self) -> FloatArray:
-        """Joint motions (2, n) of the rotations r and p in the sense they are planned."""
-        return in_sense(self.theta_r, self.theta_p, self.q_hat[1:3])
+    motion: PlannedMotion
+    partition: TaskPartition
+    visibility: FaceVisibility
+    open_goal: GoalOfIncidences | None = None
+    search: JointSpaceSearch | None = None
+    carried: CarriedByObject | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -1,6 +1,5 @@
 """Generated regions: references written by the code that they describe."""
 
-import dataclasses
 import inspect
 import re
 import types
@@ -43,13 +42,13 @@ def run_file() -> Iterator[str]:
 
 
 def fields(record: type, *, arrays: bool) -> Iterator[tuple[str, ...]]:
-    """Rows of the table of a record's attributes, or of its arrays: its own, then those of its parts."""
-    hints = typing.get_type_hints(record)
-    own = vars(record)["__annotations__"]
-    for field in sorted(dataclasses.fields(record), key=lambda field: field.name not in own):
+    """Rows of the table of a record's attributes, or of its arrays, with those of its parts."""
+    lacking = records.optional_names(record)
+    for field in records.flat_fields(record):
         about, dims = field.metadata, field.metadata.get("dims")
         if arrays == (dims is not None):
-            hint = typing.get_args(hints[field.name])[0] if "by_view" in about else hints[field.name]
+            hint = typing.get_args(field.type)[0] if "by_view" in about else field.type
+            hint = hint | None if field.name in lacking else hint
             what = plain(hint) if dims is None else text(", ".join(dims))
             units = text(about["units"]) if arrays or "number" in what else ""
             name = f"{field.name}_<view>" if "by_view" in about else field.name

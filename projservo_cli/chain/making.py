@@ -205,14 +205,14 @@ class Chain:
                 continue
             from projservo_cli.stages.carried_goals import too_far
 
-            plan = self.run.results[step.name].records[""]
-            self.listener.say(plan.object_words)
-            if plan.object_shift_mm is None:
+            carried = self.run.results[step.name].records[""].carried
+            self.listener.say(carried.object_words)
+            if carried.object_shift_mm is None:
                 self.listener.say(
                     "objects.max_displacement_m is not compared, since no length on the tool is known: set "
                     "markers.positions_m, markers.tag_size_m or markers.board.size_m"
                 )
-            if (far := too_far(plan, carrier)) is None:
+            if (far := too_far(carried, carrier)) is None:
                 continue
             if not self.confirm:
                 self._fail(motion, failed([far]))

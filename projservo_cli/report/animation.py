@@ -111,7 +111,7 @@ def motion_of(
     tool, scene = features_in_space(plant, traces) or np.zeros((2, 0, 3, 3))
     features = transformed(style.outlines(tool), np.asarray(np.linalg.inv(of_face), dtype=np.float64))
     runs = {name: _driven(robot, plant, (markers, features), rig, trace) for name, trace in traces.items()}
-    edges = () if plan.tree_q is None else tree_edges(plan)
+    edges = tree_edges(plan)
     trees = tuple(with_gaps(_centers(plant, q.reshape(-1, q.shape[-1]))) for q in edges)
     cameras = transformed(rig, of_rig)
     return _Motion(

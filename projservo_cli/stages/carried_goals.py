@@ -1,8 +1,6 @@
 """The object that a goal was taught on: looked at anew, and the goal carried along."""
 
 import math
-from dataclasses import fields
-from typing import Any
 
 import numpy as np
 
@@ -42,16 +40,15 @@ def in_metres(calibration: Calibration, known: KnownLengths) -> tuple[Metric | N
 
 def carried_goal(
     scenario: Scenario, carrier: CarryingObject, before: Plan | None = None, session: Session | None = None
-) -> tuple[Scenario, dict[str, Any]]:
-    """Look at the object anew, and carry the goal along: the scenario with it, and the fields of its plan.
+) -> tuple[Scenario, CarriedByObject]:
+    """Look at the object anew, and carry the goal along: the scenario with it, and what its plan tells of it.
 
     before : plan to the same goal from elsewhere, for which it was looked at; None to look now.
     session : connection to the robot that looks; None for one of its own.
     Raises WorkFailed where images do not show the object or the goal well enough.
     """
-    if before is not None and before.s_carried is not None:
-        known = {one.name: getattr(before, one.name) for one in fields(CarriedByObject)}
-        return scenario.carried(before.s_carried), known
+    if before is not None and before.carried is not None:
+        return scenario.carried(before.carried.s_carried), before.carried
     c = scenario.world.calibration
     metric, _ = in_metres(c, carrier.lengths)
     taught, now = scenario.world.look(carrier, session, scenario.exact, scenario.q_taught)
@@ -61,39 +58,37 @@ def carried_goal(
     except WorkFailed as error:
         raise words.failed(error.findings, stage=f"objects.{carrier.name}") from error
     rigid, limits = found.coordinates == 6, carrier.limits
-    found_now: dict[str, Any] = {
-        "object_name": carrier.name,
-        "object_shift_mm": _known(found.shift_mm),
-        "object_angle_deg": _known(found.angle_deg),
-        "object_shift_px": found.shift_px,
-        "goal_deviation_mm": _known(goal.position_mm),
-        "goal_deviation_deg": goal.rotation_deg if rigid else None,
-        "goal_deviation_px": goal.rms_px,
-        "object_marker": np.array(carrier.numbers, dtype=np.int64),
-        "object_left_out": ", ".join(map(str, found.left_out)) or None,
-        "s_object": now.s,
-        "s_object_taught": taught.s,
-        "sigma_object": now.sigma,
-        "s_carried": np.ascontiguousarray(goal.s[:, c.indices_of(scenario.world.numbers)]),
-    }
+    carried = CarriedByObject(
+        object_name=carrier.name,
+        object_shift_mm=_known(found.shift_mm),
+        object_angle_deg=_known(found.angle_deg),
+        object_shift_px=found.shift_px,
+        goal_deviation_mm=_known(goal.position_mm),
+        goal_deviation_deg=goal.rotation_deg if rigid else None,
+        goal_deviation_px=goal.rms_px,
+        object_marker=np.array(carrier.numbers, dtype=np.int64),
+        object_left_out=", ".join(map(str, found.left_out)) or None,
+        s_object=now.s,
+        s_object_taught=taught.s,
+        sigma_object=now.sigma,
+        s_carried=np.ascontiguousarray(goal.s[:, c.indices_of(scenario.world.numbers)]),
+    )
     for unit in ("mm", "px"):
-        key, at = f"max_goal_deviation_{unit}", found_now[f"goal_deviation_{unit}"]
+        key, at = f"max_goal_deviation_{unit}", getattr(carried, f"goal_deviation_{unit}")
         if at is not None and at > (most := getattr(limits, key)):
             per, of = {"mm": (1e-3, "m")}.get(unit, (1.0, unit)), Subject(name=key)
             inexact = Finding("carried_inexact", REFUSES, of, per[0] * at, limit=per[0] * most, unit=per[1])
             raise words.failed([inexact], stage=f"objects.{carrier.name}")
-    return scenario.carried(found_now["s_carried"]), found_now
+    return scenario.carried(carried.s_carried), carried
 
 
-def too_far(plan: Plan, carrier: CarryingObject | None) -> Finding | None:
+def too_far(carried: CarriedByObject, carrier: CarryingObject) -> Finding | None:
     """Return why somebody should look before a robot goes to a carried goal; None if that is not needed."""
-    if carrier is None:
-        return None
     limits, subject = carrier.limits, Subject(name=carrier.name)
     for at, most, unit in (
-        (plan.object_shift_mm and 1e-3 * plan.object_shift_mm, limits.max_displacement_m, "m"),
+        (carried.object_shift_mm and 1e-3 * carried.object_shift_mm, limits.max_displacement_m, "m"),
         (
-            plan.object_angle_deg and math.radians(plan.object_angle_deg),
+            carried.object_angle_deg and math.radians(carried.object_angle_deg),
             math.radians(limits.max_rotation_deg),
             "rad",
         ),

@@ -47,13 +47,13 @@ def connected_robot(
         readings = scenario.termination.max_steps + 1 + WINDOW
         monitor = ImageMonitor(calibration, noise, readings, visible, plant.image_size)
     watch = None
-    if plan is not None and plan.s_object is not None and plan.object_marker is not None:
-        name, numbers = plan.object_name or "", plan.object_marker.tolist()
+    if plan is not None and (carried := plan.carried) is not None:
+        name, numbers = carried.object_name, carried.object_marker.tolist()
         places = np.array([contract.driven.further.index(number) for number in numbers])
         if name not in session.held.values():  # else it moves with the tool
-            sigma, by_motion = plan.sigma_object, images_by_motion(calibration, plan.s_object)
-            sigma = np.full(plan.s_object.shape[:2], np.nan) if sigma is None else sigma
-            watch = ObjectWatch(name, numbers, places, plan.s_object, sigma, by_motion)
+            s, sigma = carried.s_object, carried.sigma_object
+            sigma = np.full(s.shape[:2], np.nan) if sigma is None else sigma
+            watch = ObjectWatch(name, numbers, places, s, sigma, images_by_motion(calibration, s))
     session.at = watch if scenario.world.inputs.displaced is None else None
     return DrivenRobot(steered, plant, _known_of(scenario, contract, calibration, law), monitor, watch)
 

@@ -1,7 +1,6 @@
 """The motion of a plan by its profile, its time, and paths to the goal for a run that is under way."""
 
 import math
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -35,7 +34,7 @@ from projservo_cli.planning.rrt_connect import (
     within_region,
 )
 from projservo_cli.planning.time_parameterization import TimedPath, joints_at, minimum_time
-from projservo_cli.records import NO_SPREAD, FloatArray, Model, Plan, Spread, WorkFailed
+from projservo_cli.records import NO_SPREAD, FloatArray, Model, Plan, Spread, WorkFailed, changed
 from projservo_cli.settings.task import Trajectory
 from projservo_cli.stages.plan_summary import sight_of, verdict_of
 from projservo_cli.stages.scenario import Scenario
@@ -280,7 +279,7 @@ class PathReplanner:
         found = _sampled_path(self._reaching, path.timing, asked.n_samples)
         H, H_start = (forward_kinematics(self._reaching.model, q) for q in (start, plan.q_start))
         sigma, duration = np.linspace(0.0, 1.0, len(found.mu)), float(path.timing.time[-1])
-        return replace(
+        return changed(
             plan,
             q_start=start,
             A=plan.A @ (H @ np.linalg.inv(H_start)).T,

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -26,12 +25,16 @@ from projservo_cli.planning.shown_joints import NEAR_PX, joints_showing
 from projservo_cli.records import (
     NO_SPREAD,
     Calibration,
+    FaceVisibility,
     FloatArray,
+    GoalOfIncidences,
     InputError,
     JointLimits,
     Model,
     Observation,
     Plan,
+    PlannedMotion,
+    TaskPartition,
     WorkFailed,
     in_sense,
 )
@@ -141,7 +144,7 @@ def run(
     scenario = scenario_of(inputs, calibration)
     if not scenario.untested:
         _require_taught_since(scenario, calibration)
-    carried: dict[str, Any] = {}
+    carried = None
     if inputs.carrier is not None:
         scenario, carried = carried_goal(scenario, inputs.carrier, before, session)
     plan = _to_any_goal(scenario) if inputs.incidences else _plan_in(scenario)
@@ -152,7 +155,7 @@ def run(
         *(() if face is None else _uneven(face)),
     )
     reason = "; ".join((plan.reason, *lines(further, setup_of(calibration))))
-    return replace(plan, reason=reason, findings=plan.findings + further, **carried)
+    return replace(plan, reason=reason, findings=plan.findings + further, carried=carried)
 
 
 def _plan_in(scenario: Scenario) -> Plan:
@@ -203,7 +206,9 @@ def _to_any_goal(scenario: Scenario) -> Plan:
             failures.append(error)
             continue
         free = len(free_motions(task.incidences, H, joint_operators(model, q)))
-        plans.append(replace(plan, incidences=names, free_dof=free, s_goal=s_goal))
+        plans.append(
+            replace(plan, open_goal=GoalOfIncidences(incidences=names, free_dof=free, s_goal=s_goal))
+        )
         if plan.feasible:
             break
     if not plans:
@@ -365,6 +370,60 @@ def _minimum_of(motion: Motion) -> tuple[FloatArray, FloatArray]:
     return np.array([column[i] for column, i in zip(constraints, instants, strict=True)]), motion.mu[instants]
 
 
+def _motion_of(found: Found) -> PlannedMotion:
+    """Samples of a motion that was found."""
+    along, time = found.motion.along, found.time
+    min_margin, min_margin_mu = _minimum_of(found.judged)
+    return PlannedMotion(
+        path_parameter=np.linspace(0.0, 1.0, len(time)),
+        time=time,
+        duration=float(time[-1]) if math.isfinite(time[-1]) else None,
+        mu=found.motion.mu,
+        H_d=along.H_d,
+        s=along.s,
+        margin=along.visibility,
+        border_distance=along.distance,
+        q=along.q,
+        joint_margin=along.limit,
+        reciprocal_condition=along.condition,
+        min_margin=min_margin,
+        min_margin_mu=min_margin_mu,
+    )
+
+
+def _partition_of(
+    state: State, task: Task, parts: Parts, images: TaskImages, amplitudes: FloatArray
+) -> TaskPartition:
+    """Translation and rotations of a task, by the amplitudes (3,) of its motion."""
+    face, (tau, theta_r, theta_p) = images.by_points(), (float(x) for x in amplitudes)
+    center = center_of(task.A_star, images.center)
+    return TaskPartition(
+        s_start=face.s_start,
+        s_star=face.s_star,
+        A=state.A,
+        A_star=task.A_star,
+        A_t=state.A_t,
+        A_r=state.A_r,
+        a=np.array(parts.a),
+        a_star=np.array(face_plane(task.A_star, task.order, center)),
+        a_t=np.array(parts.a_t),
+        A_c=np.array(parts.A_c),
+        A_c_star=np.array(center),
+        q_start=images.q_start,
+        q_hat=_joint_motions(state),
+        H_hat=_operators_of(parts),
+        tau=tau,
+        theta_r=theta_r,
+        theta_p=theta_p,
+        theta_s=composed_angle(theta_r, theta_p)[0],
+    )
+
+
+def _operators_of(parts: Parts) -> FloatArray:
+    """Operators t, r, p (3, 4, 4) of a partitioned task."""
+    return np.array([as_array(H) for H in (parts.H_t, parts.H_r, parts.H_p)])
+
+
 def _planned(
     model: Model,
     images: TaskImages,
@@ -373,9 +432,8 @@ def _planned(
     search: JointSearch | None,
 ) -> tuple[Plan, Finding | None]:
     """Return the plan of one profile, and the first constraint that fails; None if all hold."""
-    face = images.by_points()
     state, task, parts, arrives = _partitioned(model, images, trajectory, demands.limits)
-    H_hat = np.array([as_array(H) for H in (parts.H_t, parts.H_r, parts.H_p)])
+    H_hat = _operators_of(parts)
     a, amplitudes = np.array(parts.a), np.array([parts.tau, parts.theta_r, parts.theta_p])
     tau_0, theta_0 = _changes(a, H_hat, task)
     tau_limit = min((trajectory.visibility_fraction * t for t in tau_0 if t > 0.0), default=math.inf)
@@ -399,7 +457,6 @@ def _planned(
     )
     found = _found(reaching, task, trajectory, search, (pure_t, pure_r))
     motion, along, time, path = found.motion, found.motion.along, found.time, found.path
-    tau, theta_r, theta_p = (float(x) for x in motion.reaching.amplitudes)
     if len(images.q_start) < COORDINATES and path is None:
         _require_in_span(model, state.A, images.q_start, along.s)
     sense, sense_margin = _senses(parts, task)
@@ -408,7 +465,6 @@ def _planned(
     if path is None and not arrives:
         about += (Finding("half_turn", LIMITS),)
     ends = () if path is None or path.timing is None else tuple(relaxed(path, along.q, images.view))
-    min_margin, min_margin_mu = _minimum_of(found.judged)
     plan = Plan(
         profile=trajectory.profile,
         feasible=usable(about),
@@ -416,45 +472,18 @@ def _planned(
         findings=about + ends,
         relaxed_constraints=lines(ends, _setup(images)),
         view=images.view,
-        tau=tau,
-        theta_r=theta_r,
-        theta_p=theta_p,
-        theta_s=composed_angle(theta_r, theta_p)[0],
         constraint=constraint,
-        duration=float(time[-1]) if math.isfinite(time[-1]) else None,
-        tau_limit=tau_limit,
-        path_parameter=np.linspace(0.0, 1.0, len(time)),
-        time=time,
-        mu=motion.mu,
-        H_d=along.H_d,
-        s=along.s,
-        margin=along.visibility,
-        border_distance=along.distance,
-        q=along.q,
-        joint_margin=along.limit,
-        reciprocal_condition=along.condition,
-        min_margin=min_margin,
-        min_margin_mu=min_margin_mu,
-        s_start=face.s_start,
-        s_star=face.s_star,
-        A=state.A,
-        A_star=task.A_star,
-        A_t=state.A_t,
-        A_r=state.A_r,
-        a=a,
-        a_star=np.array(face_plane(task.A_star, task.order, center_of(task.A_star, images.center))),
-        a_t=np.array(parts.a_t),
-        A_c=np.array(parts.A_c),
-        A_c_star=np.array(center_of(task.A_star, images.center)),
-        q_start=images.q_start,
-        q_hat=_joint_motions(state),
-        H_hat=H_hat,
-        optical_center=task.O,
-        tau_0=tau_0,
-        theta_0=theta_0,
-        sense=sense,
-        sense_margin=sense_margin,
-        **({} if path is None else search_summary(path, along.q, time, trajectory.search.seed)),
+        motion=_motion_of(found),
+        partition=_partition_of(state, task, parts, images, motion.reaching.amplitudes),
+        visibility=FaceVisibility(
+            optical_center=task.O,
+            tau_0=tau_0,
+            theta_0=theta_0,
+            sense=sense,
+            sense_margin=sense_margin,
+            tau_limit=tau_limit,
+        ),
+        search=None if path is None else search_summary(path, along.q, time, trajectory.search.seed),
     )
     holds = usable([nearest]) or (path is not None and plan.feasible)
     return plan, found.entered or (None if holds else nearest)

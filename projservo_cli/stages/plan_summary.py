@@ -3,7 +3,6 @@
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -23,7 +22,7 @@ from projservo_cli.planning.margins import (
 )
 from projservo_cli.planning.rrt_connect import JointPath, Tree, may_start
 from projservo_cli.planning.time_parameterization import TimedPath
-from projservo_cli.records import FloatArray, IntArray
+from projservo_cli.records import FloatArray, IntArray, JointSpaceSearch
 
 
 def verdict_of(motion: Motion) -> tuple[str, Finding]:
@@ -97,24 +96,27 @@ _MOST_NODES = 2_000
 _TOLD = 2
 
 
-def search_summary(path: JointPath, q: FloatArray, time: FloatArray, seed: int) -> dict[str, Any]:
-    """Fields of a plan that a search came to, with joints (s, n) at times (s,); NaN where it found none."""
-    summary: dict[str, Any] = {
-        "n_goal_configurations": path.n_goals,
-        "n_goals_tried": len(path.goals),
-        "n_search_samples": path.draws,
-        "seed": seed,
-        "tree_nodes": 0,
-    }
-    if path.trees is not None:
-        summary["tree_nodes"] = sum(int(tree.size[0]) for tree in path.trees)
-        summary["tree_q"], summary["tree_parent"] = _stored(path.trees)
-    if path.timing is None:
-        return summary
-    summary["margins"], summary["required_margins"] = _along(path.constraints, q)
-    took = float(path.timing.time[-1])
-    summary["blends"] = _corners_of(path.timing) * (float(time[-1]) / took if took > 0.0 else 1.0)
-    return summary
+def search_summary(path: JointPath, q: FloatArray, time: FloatArray, seed: int) -> JointSpaceSearch:
+    """What a search came to, with joints (s, n) at times (s,); NaN where it found none."""
+    trees = path.trees or ()
+    tree_q, tree_parent = _stored(path.trees) if path.trees is not None else (None, None)
+    margins, required, blends = None, None, None
+    if path.timing is not None:
+        margins, required = _along(path.constraints, q)
+        took = float(path.timing.time[-1])
+        blends = _corners_of(path.timing) * (float(time[-1]) / took if took > 0.0 else 1.0)
+    return JointSpaceSearch(
+        n_goal_configurations=path.n_goals,
+        n_goals_tried=len(path.goals),
+        n_search_samples=path.draws,
+        seed=seed,
+        tree_nodes=sum(int(tree.size[0]) for tree in trees),
+        tree_q=tree_q,
+        tree_parent=tree_parent,
+        margins=margins,
+        required_margins=required,
+        blends=blends,
+    )
 
 
 def _stored(trees: tuple[Tree, Tree]) -> tuple[FloatArray, IntArray]:

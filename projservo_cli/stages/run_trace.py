@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -28,6 +28,7 @@ from projservo_cli.records import (
     FloatArray,
     Plan,
     Trace,
+    flat_fields,
 )
 from projservo_cli.simulation.analytic_plant import rig_distance
 from projservo_cli.simulation.faults import obstruction_of
@@ -133,7 +134,7 @@ def trace_of(run: LawRun) -> Trace:
 
 # Numbers of a trace that are those of the summary of its run, and one more.
 _SUMMARY_FIELDS = [
-    field.name for field in fields(Trace) if field.name in {*Summary._fields, "center_deviation_mm"}
+    field.name for field in flat_fields(Trace) if field.name in {*Summary._fields, "center_deviation_mm"}
 ]
 
 
@@ -178,8 +179,8 @@ def _stated_mm(run: LawRun) -> dict[str, Any]:
         every = np.zeros((len(scenario.world.view), len(calibration.marker)), dtype=np.bool_)
         every[:, calibration.indices_of(numbers)] = used
         found["undetected_position_error_mm"] = run.driven.monitor.undetected_mm(q, every, posture)
-    if isinstance(run.plan, Plan) and run.plan.object_name is not None:
-        parts.append(run.plan.goal_deviation_mm or 0.0)
+    if isinstance(run.plan, Plan) and run.plan.carried is not None:
+        parts.append(run.plan.carried.goal_deviation_mm or 0.0)
     elif (goal := scenario.goal_pixels) is not None:
         parts.append(rigid_fit(calibration, q, *goal).off_mm(posture, calibration.M))
     return found | {"estimated_position_error_mm": float(np.linalg.norm([*parts, *found.values()]))}
@@ -247,7 +248,7 @@ def _incidence_errors(run: LawRun, images: TaskImages, H: FloatArray, taught: Fl
     taught : (g, 4, 4) displacements of the body where each was taught.
     """
     scenario, world, plan = run.scenario, run.scenario.world, run.plan
-    on_object = plan if isinstance(plan, Plan) and plan.object_name else None
+    on_object = plan.carried if isinstance(plan, Plan) else None
     s, shown = np.full_like(images.s_star, np.nan), run.log.s[run.steps]
     s[:, : shown.shape[1]] = shown  # of a law that measures points those of the face alone
     now = Look(s, np.full(s.shape[:2], max(world.noise_px, _EXACT_PX)))

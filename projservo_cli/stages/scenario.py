@@ -80,11 +80,12 @@ class Scenario:
 
     def towards(self, plan: Plan) -> Self:
         """Return the scenario with the goal that a plan carried along, or chose among those of incidences."""
-        found = self if plan.s_carried is None else self.carried(plan.s_carried)
-        if plan.s_goal is None and plan.s_carried is None:
+        found = self if plan.carried is None else self.carried(plan.carried.s_carried)
+        if plan.open_goal is None and plan.carried is None:
             return found
         end = plan.q[-1:] if np.isfinite(plan.q[-1:]).all() else self.goal_joints[:0]
-        return replace(found, s_chosen=plan.s_goal, goal_joints=end)
+        chosen = None if plan.open_goal is None else plan.open_goal.s_goal
+        return replace(found, s_chosen=chosen, goal_joints=end)
 
     def carried(self, s: FloatArray) -> Self:
         """Return the scenario with a goal that was carried along, of which no joints are known.

@@ -42,6 +42,12 @@ from projservo_cli.records import (
     Plan,
     Report,
     Trace,
+    changed,
+    composed,
+    flat_fields,
+    has_default,
+    is_optional,
+    optional_names,
     scalars_of,
 )
 from projservo_cli.words import line, sentence, setup_of
@@ -350,7 +356,7 @@ def save_record(group: "h5netcdf.Group", record: Any) -> None:
     """Store each field of a record that is not None."""
     group.attrs["record"] = type(record).__name__
     sizes, arrays = dict(SIZES), {}
-    for field in dataclasses.fields(record):
+    for field in flat_fields(type(record)):
         value = getattr(record, field.name)
         if value is not None and "dims" in field.metadata:
             arrays[field] = np.asarray(value)
@@ -416,18 +422,20 @@ def load_record(group: h5py.Group, kind: Any, sizes: dict[str, int]) -> Any:
     """Read a record; ``sizes`` has the sizes of common dimensions, and gets the number of joints."""
     if attribute(group, "record", str) != kind.__name__:
         raise ValueError(f"{group.name} is no {kind.__name__}")
-    hints, own = typing.get_type_hints(kind), dict(sizes)
+    own, lacking = dict(sizes), optional_names(kind)
     views = attribute(group, "view", list) if "view" in group.attrs else VIEWS
     values: dict[str, Any] = {}
-    for field in dataclasses.fields(kind):
-        name, dims, hint = field.name, field.metadata.get("dims"), hints[field.name]
-        optional = type(None) in typing.get_args(hint)
-        inner = typing.get_args(hint)[0] if optional else hint
+    for field in flat_fields(kind):
+        name, dims, optional = field.name, field.metadata.get("dims"), is_optional(field)
+        inner = typing.get_args(field.type)[0] if optional else field.type
+        stored = name in (group.attrs if dims is None else group)
         if "by_view" in field.metadata:
-            each, names = typing.get_args(hint)[0], (f"{name}_{view}" for view in views)
+            each, names = typing.get_args(inner)[0], (f"{name}_{view}" for view in views)
             values[name] = tuple(_value(one, attribute(group, one), each) for one in names)
-        elif name not in (group.attrs if dims is None else group) and (optional or _has_default(field)):
-            values[name] = field.default if _has_default(field) else None
+        elif not stored and name in lacking and not (optional or has_default(field)):
+            continue  # with its part, or the part cannot be made
+        elif not stored and (optional or has_default(field)):
+            values[name] = field.default if has_default(field) else None
         elif dims is None:
             values[name] = _value(name, attribute(group, name), inner)
         else:
@@ -439,9 +447,9 @@ def load_record(group: h5py.Group, kind: Any, sizes: dict[str, int]) -> Any:
         sizes["joint"] = own["joint"]
     if "joint_types" in values and not re.fullmatch(f"[RP]{{{own['joint']}}}", values["joint_types"]):
         raise ValueError(f"joint_types are not {own['joint']} letters R and P")
-    record = kind(**values)
+    record = composed(kind, values)
     if "findings" in values and "findings" not in group.attrs:
-        return dataclasses.replace(record, findings=_told(record))
+        return changed(record, findings=_told(record))
     return record
 
 
@@ -469,10 +477,6 @@ def _told_of(c: Calibration) -> tuple[Finding, ...]:
         if text not in known:
             found.append(told(text, NOTE if text in c.notes else LIMITS))
     return tuple(found)
-
-
-def _has_default(field: "dataclasses.Field[Any]") -> bool:
-    return field.default is not dataclasses.MISSING
 
 
 def _array(data: Any, dims: tuple[str, ...], hint: Any, sizes: dict[str, int]) -> npt.NDArray[Any]:

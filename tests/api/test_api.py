@@ -16,7 +16,7 @@ import projservo_cli as ps
 from projservo_cli import cli
 from projservo_cli.calibration import prediction_variance
 from projservo_cli.planning import shown_joints
-from projservo_cli.records import Calibration, Observation, Trace
+from projservo_cli.records import Calibration, Observation, Trace, changed, flat_fields
 from projservo_cli.store.observation_tables import read_table, write_table
 from tests.configured import calibrate
 from tests.conftest import ROOT
@@ -59,7 +59,7 @@ def begun(calibrated_run, tmp_path):
 
 def alike(first, second, kind):
     """Whether records are equal to the bit but for the time they took."""
-    for one in dataclasses.fields(kind):
+    for one in flat_fields(kind):
         a, b = getattr(first, one.name), getattr(second, one.name)
         if one.name != "seconds":
             np.testing.assert_array_equal(np.array(a), np.array(b), err_msg=one.name)
@@ -102,9 +102,9 @@ def test_deviations_are_those_of_the_covariance(made):
         for k in range(values.size):
             ends = []
             for sign in (1.0, -1.0):
-                changed = values.copy()
-                changed.flat[k] += sign * step
-                ends.append(dataclasses.replace(calibration, **{name: changed}).predict(q).ravel())
+                moved = values.copy()
+                moved.flat[k] += sign * step
+                ends.append(changed(calibration, **{name: moved}).predict(q).ravel())
             columns.append((ends[0] - ends[1]) / (2.0 * step))
     J = np.array(columns).T
     sigma = calibration.predict(q, return_std=True)[1].ravel()

@@ -8,6 +8,7 @@ import numpy as np
 
 from projservo_cli.config import load_config
 from projservo_cli.config.schema import json_schema
+from projservo_cli.records import flat_fields
 from projservo_cli.store.run_file import load
 from tests.report.conftest import read, words
 
@@ -23,7 +24,8 @@ def test_an_export_holds_every_array_and_says_what_it_is(projservo, reported, tm
     records = {(name, part): record for name, result in results for part, record in result.records.items()}
     for (name, part), record in records.items():
         table = "_".join(filter(None, (*name.split("/"), part))) + ".csv"
-        values = {field: value for field, value in vars(record).items() if value is not None}
+        every = {field.name: getattr(record, field.name) for field in flat_fields(type(record))}
+        values = {field: value for field, value in every.items() if value is not None}
         counts = dict.fromkeys(values, 0)
         with (folder / table).open(newline="") as file:
             for heading, *cells in zip(*csv.reader(file), strict=True):

@@ -1,11 +1,11 @@
 """The real stages through the command line: refusals, runs that repeat, options, what is read afterwards."""
 
-import dataclasses
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from projservo_cli.records import flat_fields
 from projservo_cli.store import run_file
 from tests.conftest import ROOT
 
@@ -58,7 +58,7 @@ def arrays(run):
         f"{name}/{label}/{field.name}": getattr(record, field.name)
         for name, result in run.results.items()
         for label, record in result.records.items()
-        for field in dataclasses.fields(record)
+        for field in flat_fields(type(record))
         if "dims" in field.metadata
     }
 

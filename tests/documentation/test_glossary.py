@@ -79,7 +79,7 @@ def test_names_of_the_glossary_stand_in_the_code():
         field.name
         for kind in vars(records).values()
         if dataclasses.is_dataclass(kind) and isinstance(kind, type)
-        for field in dataclasses.fields(kind)
+        for field in records.flat_fields(kind)
     }
     fields |= {name for kind in vars(records).values() for name in getattr(kind, "_fields", ())}
     # A test of the page on commands compares these with the output of the commands.

@@ -10,7 +10,7 @@ from scipy.stats import chi2
 import projservo_cli as projservo
 from projservo_cli.config.whole import truth_of
 from projservo_cli.metric.frame import Metric
-from projservo_cli.records import Calibration, InputError, WorkFailed
+from projservo_cli.records import Calibration, InputError, WorkFailed, composed, flat_fields
 from projservo_cli.results import ImageModel
 from tests.calibration.simulated_robot import Robot, rig
 from tests.known import configured
@@ -31,7 +31,7 @@ def calibrated(arm, frame):
     back, n = np.linalg.inv(frame), len(arm.joint_types)
     a_inf = np.array([0.0, 0.0, 0.0, 1.0]) @ back
     M = arm.markers @ frame.T
-    fields = {field.name: None for field in dataclasses.fields(Calibration)}
+    fields = {field.name: None for field in flat_fields(Calibration)}
     fields |= {
         "method": "bundle_adjustment",
         "joint_types": arm.joint_types,
@@ -48,7 +48,7 @@ def calibrated(arm, frame):
         "joint_min": np.full(n, -1.0),
         "excitation": np.full(n, 2.0),
     }
-    return ImageModel(**fields)
+    return ImageModel.of(composed(Calibration, fields))
 
 
 ELBOW = (revolute(0.1 * X, Z), revolute(0.2 * Z, Y), revolute(0.4 * Z, Y), revolute(0.5 * Z, X))

@@ -1,6 +1,5 @@
 """Plans of the profiles joint_space and auto, and runs that follow them to the goal."""
 
-from dataclasses import fields
 from functools import lru_cache
 
 import numpy as np
@@ -8,6 +7,7 @@ import pytest
 
 from projservo_cli.calibration import predict
 from projservo_cli.geometry.kinematics import forward_kinematics
+from projservo_cli.records import flat_fields
 from projservo_cli.simulation.random_tasks import random_tasks
 from projservo_cli.task.target import followed
 from projservo_cli.task.trajectory import planned
@@ -84,7 +84,7 @@ def test_auto_is_linear_to_the_bit_where_that_keeps_every_constraint():
     for profile in ("linear", "auto"):
         config = configured("paper", f"trajectory.profile={profile}")
         plans.append(planning.run(config, calibrated("paper")[1]))
-    for field in fields(plans[0]):
+    for field in flat_fields(type(plans[0])):
         np.testing.assert_array_equal(*(getattr(plan, field.name) for plan in plans), err_msg=field.name)
 
 

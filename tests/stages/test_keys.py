@@ -1,7 +1,6 @@
 """Keys: a stage reads what its key is made of and nothing else, and a key is made of no more than that."""
 
 import contextlib
-import dataclasses
 import json
 import shutil
 import sys
@@ -14,7 +13,7 @@ import pytest
 
 from projservo_cli.config import load_config
 from projservo_cli.config.inputs import calibration_inputs, files_of, plan_inputs, report_inputs, servo_inputs
-from projservo_cli.records import WorkFailed
+from projservo_cli.records import WorkFailed, flat_fields
 from projservo_cli.result_hashes import encoded, key_of
 from projservo_cli.simulation.mjcf import files_named
 from projservo_cli.stages import calibrate, plan, servo
@@ -68,7 +67,7 @@ def same(first, second):
             if one is not other:
                 return False
             continue
-        for field in dataclasses.fields(one):
+        for field in flat_fields(type(one)):
             values = (getattr(one, field.name), getattr(other, field.name))
             if field.name != "seconds" and encoded(values[0]) != encoded(values[1]):
                 return False

@@ -66,7 +66,7 @@ def test_a_goal_is_carried_along_to_where_it_should_be_as_well_as_is_stated():
         ):
             seen = drawn[label][np.isfinite(drawn[label][:, 0])]
             assert {*map(tuple, seen)} == {*map(tuple, s[view])}
-    still = replace(planned, s_object_taught=None)
+    still = replace(planned, carried=None)
     assert "no object" in figure.lacking(Driven(calibration, None, still, {}))
 
 

@@ -7,6 +7,7 @@ import pytest
 
 from projservo_cli.control.law import Gains
 from projservo_cli.geometry.displacements import screws, twists
+from projservo_cli.records import changed
 from projservo_cli.report.claims import claims_of
 from projservo_cli.report.figures.path_deviation import study_numbers
 from projservo_cli.report.report_data import Composition
@@ -21,7 +22,7 @@ from tests.report.conftest import stored
 GAINS_OF_LAWS = Gains(2.5, 2.5, 2.5, 2.5, 1.0, 2.5, 0.04, 0.9)
 
 
-def changed(material, **traces):
+def with_traces(material, **traces):
     """The material with some traces replaced; None drops one."""
     kept = {law: trace for law, trace in (material.traces | traces).items() if trace is not None}
     return dataclasses.replace(material, traces=kept)
@@ -36,7 +37,7 @@ def few(monkeypatch):
 @pytest.mark.usefixtures("few")
 def test_a_report_writes_what_it_says_and_fits_the_run_file(tmp_path, monkeypatch):
     draw_only(monkeypatch, "fig01_partition", "fig04_classical", "fig08_drift")
-    material = changed(case()[2], stacked=None, blockwise=None, euclidean_points=None)
+    material = with_traces(case()[2], stacked=None, blockwise=None, euclidean_points=None)
     stale = tmp_path / "figures" / "fig04_classical.svg"
     stale.parent.mkdir()
     stale.write_text("of an earlier report")
@@ -104,7 +105,7 @@ def test_both_sides_of_eq_22_agree_to_first_order_only():
     # the third order adds a few per mille at λ = 0.02
     np.testing.assert_allclose(distance[:-1] / distance[1:], 4.0, rtol=2e-2)
     # without a translation both sides are the same
-    still = dataclasses.replace(plan, tau=0.0)
+    still = changed(plan, tau=0.0)
     assert report.composition_error(still, lambdas).max() < 1e-12
     *_, differs = claims_of(material, Composition(lambdas, distance, math.pi / 2, np.zeros(2)))
     *_, same = claims_of(material, Composition(lambdas, np.zeros(3), 0.0, np.zeros(2)))
@@ -122,13 +123,13 @@ def test_eq_22_has_its_counter_example_in_the_turn_of_the_paper_and_holds_along_
     for direction, angle in ((turn, 0.0), (np.cross(turn, [0.3, 0.5, 0.7]), math.pi / 2)):
         along = twists(np.r_[0.0, 0.0, 0.0, direction])
         H_hat = np.array([along, *plan.H_hat[1:]])
-        other = report.composition_of(dataclasses.replace(plan, H_hat=H_hat, theta_p=0.0), GAINS_OF_LAWS)
+        other = report.composition_of(changed(plan, H_hat=H_hat, theta_p=0.0), GAINS_OF_LAWS)
         assert other.axis_angle == pytest.approx(angle, abs=1e-7)
         assert (other.distance.max() < 1e-12) == (angle == 0.0)
     # Rotations that do not commute turn the face off its planned rotation, one rotation does not: eq. (21).
     assert np.degrees(of_paper.bias) == pytest.approx([8.3, 0.0], abs=0.05)
     assert np.degrees(of_paper.bias[1]) < 1e-9
-    assert report.orientation_bias(dataclasses.replace(plan, theta_p=0.0), GAINS_OF_LAWS).max() < 1e-3
+    assert report.orientation_bias(changed(plan, theta_p=0.0), GAINS_OF_LAWS).max() < 1e-3
 
 
 @pytest.mark.volume

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from projservo_cli.findings import usable
-from projservo_cli.records import InputError, Plan, Trace
+from projservo_cli.records import InputError, Plan, Trace, changed, flat_fields
 from projservo_cli.results import RunTrace
 from projservo_cli.store import run_file
 from projservo_cli.store.run_file import save_record
@@ -32,7 +32,7 @@ def path(tmp_path):
 
 def assert_same(a, b):
     assert type(a) is type(b)
-    for field in dataclasses.fields(a):
+    for field in flat_fields(type(a)):
         x, y = getattr(a, field.name), getattr(b, field.name)
         assert type(x) is type(y), field.name
         if isinstance(x, np.ndarray):
@@ -111,7 +111,7 @@ def test_plans_and_runs_of_any_views_come_back_with_counts_by_name(tmp_path, nam
 
 
 def test_names_and_arrays_of_views_must_be_as_many(tmp_path):
-    trace = dataclasses.replace(fake(Trace), view=("left",), self_occluded_steps=(1,))
+    trace = changed(fake(Trace), view=("left",), self_occluded_steps=(1,))
     run_file.save(run_file.Run(tmp_path / "run.h5", "", {"servo/exact": result(**{"": trace})}))
     assert "arrays of 2 views, named left" in refused(tmp_path)
 

@@ -536,16 +536,16 @@ _CARRIED = style.line(style.GREEN, width=1.6, label="face at the carried goal")
 def _data_object(report_data: ReportData | Driven) -> Data:
     """Images of the object of the goal when it was taught and now, and of the face at the carried goal."""
     plan, order = report_data.plan, cyclic_order(report_data.plan.A)
-    assert plan.s_object is not None
-    assert plan.s_object_taught is not None
-    assert plan.s_carried is not None
+    carried = plan.carried
+    assert carried is not None
+    assert carried.s_object_taught is not None
     return {
-        "about": np.array(plan.object_words),
+        "about": np.array(carried.object_words),
         "view": np.array(plan.view),
-        "marker": plan.object_marker if plan.object_marker is not None else np.zeros(0, dtype=np.int64),
-        "taught": plan.s_object_taught,
-        "now": plan.s_object,
-        "face": plan.s_carried[:, order],
+        "marker": carried.object_marker,
+        "taught": carried.s_object_taught,
+        "now": carried.s_object,
+        "face": carried.s_carried[:, order],
     }
 
 

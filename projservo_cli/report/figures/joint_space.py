@@ -46,7 +46,7 @@ def _data(report_data: ReportData) -> Data:
     plan, order, model = report_data.plan, report_data.plant.order, report_data.calibrated
     slides = report_data.robot.prismatic
     unit = joint_units(slides)
-    timed = bool(np.isfinite(plan.time).all())
+    timed, search = bool(np.isfinite(plan.time).all()), plan.search
     name = f"{plan.profile.replace('_', ' ')} profile"
     if plan.profile == "joint_space" and not plan.feasible:
         name = "no path found, linear motion"
@@ -61,7 +61,7 @@ def _data(report_data: ReportData) -> Data:
         "q_deg_or_mm": plan.q * unit,
         "q_start_deg_or_mm": plan.q_start * unit,
         "limits_deg_or_mm": np.stack([report_data.robot.limits.lower, report_data.robot.limits.upper]) * unit,
-        "corner_s": np.zeros((0, 2)) if plan.blends is None else plan.blends,
+        "corner_s": np.zeros((0, 2)) if search is None or search.blends is None else search.blends,
         "visibility": plan.margin,
         "joints": plan.joint_margin[:, None],
         "conditioning": (plan.reciprocal_condition / plan.reciprocal_condition[0])[:, None],
@@ -71,8 +71,8 @@ def _data(report_data: ReportData) -> Data:
         for view in plan.view:
             if (polygon := getattr(region, view, None)) is not None:
                 result[f"kept_out_{view}_{i}"] = np.array(polygon)
-    if plan.tree_q is not None:
-        result["nodes"] = np.array([len(plan.tree_q), plan.tree_nodes])
+    if search is not None and search.tree_q is not None:
+        result["nodes"] = np.array([len(search.tree_q), search.tree_nodes])
         M = np.linalg.solve(forward_kinematics(model, plan.q_start), plan.A_c)
         for name, edges in zip(_TREES, tree_edges(plan), strict=True):
             points = np.array([forward_kinematics(model, q) @ M for q in edges.reshape(-1, edges.shape[-1])])
@@ -82,31 +82,33 @@ def _data(report_data: ReportData) -> Data:
 
 def _distances(plan: Plan, border_px: float) -> Data:
     """Return distances in px and their required values; of a joint-space path those of its constraints."""
-    if plan.margins is None or plan.required_margins is None:
+    search = plan.search
+    if search is None or search.margins is None or search.required_margins is None:
         distance = np.where(plan.border_distance > BEHIND, plan.border_distance, np.nan)
         return {"border_px": distance, "border_px_asked": np.full_like(distance, border_px)}
     distances: Data = {}
     views = len(plan.view)  # four margins have each view, between those of the joints and of regions
     width, border, clear = (np.arange(k, k + views) for k in (1 + 2 * views, 1 + 3 * views, 1 + 4 * views))
     for name, columns in (("border_px", border), ("width_px", width), ("clear_px", clear[:1])):
-        if np.isfinite(plan.margins[:, columns[0]]).all():
-            distances[name] = plan.margins[:, columns]
-            distances[f"{name}_asked"] = plan.required_margins[:, columns]
+        if np.isfinite(search.margins[:, columns[0]]).all():
+            distances[name] = search.margins[:, columns]
+            distances[f"{name}_asked"] = search.required_margins[:, columns]
     return distances
 
 
-def tree_edges(plan: Plan) -> tuple[FloatArray, FloatArray]:
+def tree_edges(plan: Plan) -> list[FloatArray]:
     """Joints (e, PIECES + 1, n) along the edges of the tree from the start, and of that from the goals."""
-    assert plan.tree_q is not None
-    assert plan.tree_parent is not None
+    if plan.search is None or plan.search.tree_q is None or plan.search.tree_parent is None:
+        return []
+    q, parent = plan.search.tree_q, plan.search.tree_parent
     share = np.linspace(0.0, 1.0, PIECES + 1)[:, None]
-    second = int(np.append(np.flatnonzero(plan.tree_parent < 0), len(plan.tree_q))[1])
+    second = int(np.append(np.flatnonzero(parent < 0), len(q))[1])
     edges = []
-    for nodes in (np.arange(second), np.arange(second, len(plan.tree_q))):
-        nodes = nodes[plan.tree_parent[nodes] >= 0]
-        start, end = plan.tree_q[plan.tree_parent[nodes], None], plan.tree_q[nodes, None]
+    for nodes in (np.arange(second), np.arange(second, len(q))):
+        nodes = nodes[parent[nodes] >= 0]
+        start, end = q[parent[nodes], None], q[nodes, None]
         edges.append(start + share * (end - start))
-    return edges[0], edges[1]
+    return edges
 
 
 def with_gaps(points: FloatArray) -> FloatArray:
