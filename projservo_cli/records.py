@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import MISSING, Field, dataclass, field, fields, replace
 from functools import cache
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, get_args
+from typing import Any, NamedTuple, TypeVar, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -1001,8 +1001,8 @@ class Plan(Composite):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class RunMetrics:
-    """Numbers by which runs of laws are compared."""
+class RunErrors(Part):
+    """How far a run ended from its goal."""
 
     position_error_mm: float | None = _scalar(
         "mm",
@@ -1030,6 +1030,12 @@ class RunMetrics:
         "part of it: by what no test tells from none, at two deviations, such as tags that moved less than "
         "backlash hides; none if images are not tested",
     )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RunMetrics(Part):
+    """Numbers by which runs of laws are compared."""
+
     success: bool | None = _optional_scalar(
         about="whether it converged and at every time, in truth, no joint was past a limit, no camera "
         "behind the face and every marker of the face in both images; none if the truth is "
@@ -1057,20 +1063,10 @@ class RunMetrics:
         about="the joint, from 0, that passed its limit first or stopped the run, -1 for none"
     )
 
-    if not TYPE_CHECKING:  # names of views are not known before a run
-
-        def __getattr__(self, name: str) -> int:
-            """Number of one view, such as ``self_occluded_steps_left``, by its name in files and JSON."""
-            if name.startswith("self_occluded_steps_"):
-                numbers = scalars_of(self)
-                if name in numbers:
-                    return numbers[name]
-            raise AttributeError(f"{type(self).__name__} has no {name}")
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class RunHistory:
-    """Arrays of a run over time: joints, images, errors, commands and true poses."""
+class RunHistory(Part):
+    """Arrays of a run over time: joints, images, errors and commands."""
 
     q: FloatArray = _array("time joint", "rad or m", "joints")
     s: FloatArray = _array("time view marker xy", "px", "measured images of the face")
@@ -1096,31 +1092,58 @@ class RunHistory:
     views_used: FloatArray = _array("time", about="markers in the fit of the body, counted once per view")
     q_dot: FloatArray = _array("step joint", "rad/s or m/s", "commands after the limit")
     speed_factor: FloatArray = _array("step", about="factor of the joint-speed limit")
+    force: FloatArray | None = _optional_array(
+        "time", "N", "force on the tool; none without stop.max_force_n"
+    )
+    latency: FloatArray | None = _optional_array(
+        "time view", "s", "time of the joint reading less the time of the image, as estimated in the run"
+    )
+    q_read: FloatArray | None = _optional_array(
+        "time joint", "rad or m", "joint readings, if they differ from the joints"
+    )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class TrueMotion(Part):
+    """True poses of a run over time; NaN if unknown."""
+
     self_occluded: BoolArray = _array("time view", about="true self-occlusion of the face")
     pose: FloatArray = _array("time row coordinate", "m", "true pose of the tool")
     goal_pose: FloatArray = _array("row coordinate", "m", "true goal pose, NaN if unknown")
     center: FloatArray = _array("time axis", "m", "true centre of the face")
-    incidence_px: FloatArray | None = _optional_array(
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class IncidenceHistory(Part):
+    """Incidences that were to hold at the goal of a run, and how far they were off."""
+
+    incidences: tuple[str, ...] = _scalar(
+        about="incidences that were to hold at the goal; none for the whole pose", default=()
+    )
+    free_dof: int | None = _optional_scalar(
+        about="number of joint motions at the goal that keep all incidences; none for the whole pose"
+    )
+    incidence_px: FloatArray = _array(
         "time incidence",
         "px",
         "error of each incidence over its deviation at one pixel of noise; none for the whole pose",
     )
-    feature_s: FloatArray | None = _optional_array(
+    feature_s: FloatArray = _array(
         "time incidence span view xy",
         "px",
         "images of the points that span each feature of the tool, as the body was measured; NaN beyond the "
         "one, two or three of a point, line or plane",
     )
-    feature_s_star: FloatArray | None = _optional_array(
+    feature_s_star: FloatArray = _array(
         "incidence span view xy", "px", "images of those of the scene, where they were taught"
     )
-    incidence_mm: FloatArray | None = _optional_array(
+    incidence_mm: FloatArray = _array(
         "incidence",
         "mm",
         "distance of features that are to meet, at the end, as stated: that which images show and its "
         "deviation, root of the sum of squares; NaN without a known length, or of others",
     )
-    incidence_deg: FloatArray | None = _optional_array(
+    incidence_deg: FloatArray = _array(
         "incidence",
         "deg",
         "angle that an incidence is off at the end, as stated likewise; NaN of points, or where the joints "
@@ -1138,41 +1161,40 @@ class RunHistory:
     incidence_deviation_deg: FloatArray | None = _optional_array(
         "incidence", "deg", "deviation of the angle by images, calibration and object"
     )
-    force: FloatArray | None = _optional_array(
-        "time", "N", "force on the tool; none without stop.max_force_n"
-    )
-    latency: FloatArray | None = _optional_array(
-        "time view", "s", "time of the joint reading less the time of the image, as estimated in the run"
-    )
-    q_read: FloatArray | None = _optional_array(
-        "time joint", "rad or m", "joint readings, if they differ from the joints"
-    )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class RecordedFrames:
-    """Camera images that were kept of a run; absent if the robot provides none."""
+class PlanFollowing(Part):
+    """How a run followed its plan."""
 
-    frame_index: IntArray | None = _optional_array(
-        "frame", about="time indices of the stored frames; absent if the robot provides none"
-    )
-    frame_s: FloatArray | None = _optional_array(
-        "frame view observed xy", "px", "all markers that were found in the frames"
-    )
-    frame_size: IntArray | None = _optional_array("frame view", about="bytes of each frame in frame_jpeg")
-    frame_jpeg: ByteArray | None = _optional_array("frame_byte", about="frames as JPEG, concatenated")
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Trace(RecordedFrames, RunHistory, RunMetrics):
-    """One closed-loop run of one law, from the first instant to its verdict."""
-
-    view: tuple[str, ...] = _scalar(about="names of the views", default=VIEWS)
-    law: str = _scalar(about="name of the control law")
     mode: str = _scalar(
         about="regulate: each step moves to the goal by the present images; track, image_track: by the plan"
     )
     planned_s: float | None = _scalar("s", "arrival of the followed plan; none for regulate")
+    replan_attempts: int = _scalar(about="number of replanning attempts", default=0)
+    unplanned: str = _scalar(
+        about="reason why a run in a following mode ran without the plan; empty if it followed", default=""
+    )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RecordedFrames(Part):
+    """Camera images that were kept of a run; absent if the robot provides none."""
+
+    frame_index: IntArray = _array(
+        "frame", about="time indices of the stored frames; absent if the robot provides none"
+    )
+    frame_s: FloatArray = _array("frame view observed xy", "px", "all markers that were found in the frames")
+    frame_size: IntArray = _array("frame view", about="bytes of each frame in frame_jpeg")
+    frame_jpeg: ByteArray = _array("frame_byte", about="frames as JPEG, concatenated")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Trace(Composite):
+    """One closed-loop run of one law, from the first instant to its verdict."""
+
+    view: tuple[str, ...] = _scalar(about="names of the views", default=VIEWS)
+    law: str = _scalar(about="name of the control law")
     verdict: str = _scalar(about="verdict of the run")
     reason: str = _scalar(about="reason of the verdict, one sentence")
     findings: tuple[Finding, ...] = _scalar(
@@ -1181,20 +1203,25 @@ class Trace(RecordedFrames, RunHistory, RunMetrics):
     steps: int = _scalar(about="commands sent")
     period: float = _scalar("s", "control period")
     features: str = _scalar(about="image features: points or body")
-    incidences: tuple[str, ...] = _scalar(
-        about="incidences that were to hold at the goal; none for the whole pose", default=()
-    )
-    free_dof: int | None = _optional_scalar(
-        about="number of joint motions at the goal that keep all incidences; none for the whole pose"
-    )
-    replan_attempts: int = _scalar(about="number of replanning attempts", default=0)
-    unplanned: str = _scalar(
-        about="reason why a run in a following mode ran without the plan; empty if it followed", default=""
-    )
     untested: str = _scalar(about="reason why the images were not tested against the calibration", default="")
     overruns: int | None = _optional_scalar(
         about="number of missed periods; none for the ideal simulated robot"
     )
+    following: PlanFollowing
+    errors: RunErrors
+    metrics: RunMetrics
+    history: RunHistory
+    truth: TrueMotion
+    of_incidences: IncidenceHistory | None = None
+    frames: RecordedFrames | None = None
+
+    def __getattr__(self, name: str) -> Any:
+        """What a part has by a name, or the number of one view, such as ``self_occluded_steps_left``."""
+        if name.startswith("self_occluded_steps_"):  # names of views are not known before a run
+            numbers = scalars_of(self)
+            if name in numbers:
+                return numbers[name]
+        return super().__getattr__(name)
 
 
 @dataclass(frozen=True, eq=False)

@@ -405,9 +405,9 @@ def _frames(traces: Mapping[str, Trace], order: IntArray, sizes: FloatArray) -> 
                 panel.set_ylabel("" if columns else f"{camera} camera\nv (px)")
                 panel.set_xlabel("u (px)" if view == views - 1 else "")
             columns.append([_Panel(panel, run, view, order) for view, panel in enumerate(column)])
-            if (film := films[name]) is not None and run.frame_index is not None:
+            if (film := films[name]) is not None and run.frames is not None:
                 for panel, frames, extent in zip(columns[-1], film, sizes, strict=True):
-                    panel.over(frames, run.frame_index, extent)
+                    panel.over(frames, run.frames.frame_index, extent)
         style.legend_below(figure, 4 if len(runs) > 2 else 2)
         figure.suptitle("time 00.00 s", fontsize=9)
 
@@ -438,9 +438,9 @@ class _Panel:
         self.axes, self.s, self.hidden = axes, run.s[:, view, order], run.self_occluded[:, view]
         self.features = np.zeros((len(run.s), 0, 3, 2))
         style.start_and_goal(axes, self.s[0], run.s_star[view, order], fill=False)
-        if run.feature_s is not None and run.feature_s_star is not None:
-            self.features = run.feature_s[:, :, :, view]
-            axes.plot(*style.outlines(run.feature_s_star[:, :, view]).T, **OF_SCENE)
+        if (found := run.of_incidences) is not None:
+            self.features = found.feature_s[:, :, :, view]
+            axes.plot(*style.outlines(found.feature_s_star[:, :, view]).T, **OF_SCENE)
         self.behind, self.paths = (
             [axes.plot([], [], **line)[0] for _ in order] for line in (style.HIDDEN, _PATH)
         )

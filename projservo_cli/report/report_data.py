@@ -384,14 +384,14 @@ def _laws(run: Run, laws: Sequence[str]) -> dict[str, Any]:
 
 def _law(trace: Trace) -> dict[str, Any]:
     """Plain values of the run of a law, with the errors of its incidences at the end."""
-    values = scalars_of(trace)
-    if trace.incidence_px is None:
+    values, found = scalars_of(trace), trace.of_incidences
+    if found is None:
         return values
     units = "mm", "deg", "deviation_mm", "deviation_deg"
-    left = [getattr(trace, f"incidence_{unit}") for unit in units]
-    known = [np.full(len(trace.incidences), np.nan) if errors is None else errors for errors in left]
+    left = [getattr(found, f"incidence_{unit}") for unit in units]
+    known = [np.full(len(found.incidences), np.nan) if errors is None else errors for errors in left]
     rows = zip(
-        trace.incidences, trace.incidence_px[-1].tolist(), *(one.tolist() for one in known), strict=True
+        found.incidences, found.incidence_px[-1].tolist(), *(one.tolist() for one in known), strict=True
     )
     keys = ("name", "error_px", "error_mm", "error_deg", "deviation_mm", "deviation_deg")
     return values | {"incidences": [dict(zip(keys, row, strict=True)) for row in rows]}
@@ -466,10 +466,11 @@ def _plan(run: Run) -> dict[str, Any]:
     """Plain values of a plan, angles in deg, and the smallest margins along it."""
     plan, values = run.plan, scalars_of(run.plan)
     angles = {f"{name}_deg": math.degrees(values.pop(name)) for name in ("theta_r", "theta_p", "theta_s")}
-    carriers = {name: values.pop(name) for name in _OF_CARRIER}
-    of_object = {name.removeprefix("object_"): value for name, value in carriers.items()}
-    of_object |= {"markers": plan.object_marker, "reason": plan.object_words}
-    objects = {} if plan.object_name is None else {of_object.pop("name"): of_object}
+    of_object = {name.removeprefix("object_"): values.pop(name) for name in _OF_CARRIER}
+    objects, name = {}, of_object.pop("name")
+    if plan.carried is not None:
+        about = {"markers": plan.carried.object_marker, "reason": plan.carried.object_words}
+        objects[name] = of_object | about
     nearest = zip(NEAREST, plan.min_margin, plan.min_margin_mu, strict=True)
     return (
         values

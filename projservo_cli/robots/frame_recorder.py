@@ -1,12 +1,12 @@
 """Frames of a run that are kept for its film, as JPEG."""
 
 import io
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from PIL import Image
 
-from projservo_cli.records import ByteArray, FloatArray
+from projservo_cli.records import ByteArray, FloatArray, RecordedFrames
 
 MOST_FRAMES = 60  # instants of a run that are kept
 _QUALITY = 85  # of JPEG
@@ -36,21 +36,21 @@ class FrameRecorder:
         if instant % self._every == 0:
             self._kept.append(_Shot(instant, s, _as_jpeg(frames)))
 
-    def fields(self) -> dict[str, Any]:
-        """The part that a ``Trace`` holds."""
+    def recorded(self) -> RecordedFrames | None:
+        """The part that a ``Trace`` holds; None of a robot without frames."""
         if self._last is None:
-            return {}
+            return None
         instant, s, frames = self._last
         shots = [*self._kept]
         if not shots or shots[-1].instant != instant:
             shots.append(_Shot(instant, s, _as_jpeg(frames)))
         whole = b"".join(one for shot in shots for one in shot.jpeg)
-        return {
-            "frame_index": np.array([shot.instant for shot in shots], dtype=np.int64),
-            "frame_s": np.array([shot.s for shot in shots]),
-            "frame_size": np.array([[len(one) for one in shot.jpeg] for shot in shots], dtype=np.int64),
-            "frame_jpeg": np.frombuffer(whole, dtype=np.uint8),
-        }
+        return RecordedFrames(
+            frame_index=np.array([shot.instant for shot in shots], dtype=np.int64),
+            frame_s=np.array([shot.s for shot in shots]),
+            frame_size=np.array([[len(one) for one in shot.jpeg] for shot in shots], dtype=np.int64),
+            frame_jpeg=np.frombuffer(whole, dtype=np.uint8),
+        )
 
 
 def _as_jpeg(frames: ByteArray) -> tuple[bytes, ...]:

@@ -1,7 +1,7 @@
 """The record of a run: its numbers and series, how far it ended from its goal, and why."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -14,7 +14,6 @@ from projservo_cli.geometry.kernels import COORDINATES
 from projservo_cli.geometry.kinematics import forward, image_jacobian, joint_operators
 from projservo_cli.geometry.lens import undistort
 from projservo_cli.laws import REGULATE
-from projservo_cli.loop.run_metrics import Summary
 from projservo_cli.loop.verdicts import (
     PLATEAU_FALL,
     Log,
@@ -26,8 +25,14 @@ from projservo_cli.monitoring.innovation_tests import WINDOW
 from projservo_cli.records import (
     BoolArray,
     FloatArray,
+    IncidenceHistory,
     Plan,
+    PlanFollowing,
+    RunErrors,
+    RunHistory,
+    RunMetrics,
     Trace,
+    TrueMotion,
     flat_fields,
 )
 from projservo_cli.simulation.analytic_plant import rig_distance
@@ -62,45 +67,81 @@ def trace_of(run: LawRun) -> Trace:
     """Record of a run that was driven."""
     scenario, log, steps = run.scenario, run.log, run.steps
     rows = steps + 1
-    before, after, views = log.fit[:rows].T
-    errors, H, read = log.errors[:rows], log.H[:rows], log.read[:rows]
     # A law that follows a plan measures the distance to the plan, not to the goal.
     remaining = _left(log, steps) if run.mode == REGULATE else (None, None)
-    joint = int(log.events[2])
-    stretch = plateau_stretch(log.judged[:rows], scenario.termination.stall_periods)
-    s_star = scenario.ends.by_points().s_star
-    driven = run.driven
+    joint, driven = int(log.events[2]), run.driven
     dark = _blind_view(log.s[:rows], scenario.world.view, WINDOW) if driven and arrived(run.verdict) else ()
     lost = [run.unseen] if run.unseen else dark
     untested = () if driven is None else scenario.untested
     found = (*_reason(run, joint, remaining), *run.replannings)
-    if driven is not None:  # the log has the predicted rest of the robot instead of readings
-        read = _whole(driven.readings, rows)
-    values = run.summary._asdict() | {"center_deviation_mm": run.deviation_mm()}
     told = None if driven is None or not driven.truths else _whole(driven.truths, rows)
-    poses = scenario.world.poses(run.plant, run.true_ends, H, told, scenario.joints_at_goal)
-    values |= poses.numbers
-    numbers: dict[str, Any] = {n: None if math.isnan(values[n]) else values[n] for n in _SUMMARY_FIELDS}
-    if numbers["success"] is not None:
-        numbers["success"] = numbers["success"] == 1.0
+    poses = scenario.world.poses(run.plant, run.true_ends, log.H[:rows], told, scenario.joints_at_goal)
+    values = run.summary._asdict() | {"center_deviation_mm": run.deviation_mm()} | poses.numbers
     return Trace(
-        **numbers,
         view=scenario.world.view,
-        self_occluded_steps=run.self_occluded_steps,
         law=run.law,
-        mode=run.mode,
-        planned_s=run.planned_s,
         verdict=run.verdict,
         reason=text(found, run.setup),
         findings=found,
-        replan_attempts=len(run.replannings),
         steps=steps,
         period=scenario.gains.period,
-        features="points" if np.isnan(views).all() else "body",
-        remaining_translation=remaining[0],
-        remaining_rotation_deg=remaining[1],
+        features="points" if np.isnan(log.fit[:rows, 2]).all() else "body",
+        untested=text((*untested, *lost), run.setup),
+        overruns=None if driven is None else driven.steered.overruns,
+        following=PlanFollowing(
+            mode=run.mode,
+            planned_s=run.planned_s,
+            replan_attempts=len(run.replannings),
+            unplanned=run.unplanned,
+        ),
+        errors=RunErrors(
+            remaining_translation=remaining[0],
+            remaining_rotation_deg=remaining[1],
+            **_known_of(RunErrors, values),
+            **_stated_mm(run),
+        ),
+        metrics=_metrics_of(run, values),
+        history=_history_of(run),
+        truth=TrueMotion(
+            self_occluded=log.hidden[:rows] > 0.5,
+            pose=poses.pose,
+            goal_pose=poses.goal_pose,
+            center=poses.center,
+        ),
+        of_incidences=_incidences(run),
+        frames=None if driven is None else driven.film.recorded(),
+    )
+
+
+def _known_of(part: type, values: Mapping[str, float]) -> dict[str, Any]:
+    """Return the values that a part of a trace has; None for NaN."""
+    names = [field.name for field in flat_fields(part) if field.name in values]
+    return {name: None if math.isnan(values[name]) else values[name] for name in names}
+
+
+def _metrics_of(run: LawRun, values: Mapping[str, float]) -> RunMetrics:
+    """Numbers of a run by which laws are compared."""
+    stretch = plateau_stretch(run.log.judged[: run.steps + 1], run.scenario.termination.stall_periods)
+    numbers = _known_of(RunMetrics, values)
+    if numbers["success"] is not None:
+        numbers["success"] = numbers["success"] == 1.0
+    return RunMetrics(
+        self_occluded_steps=run.self_occluded_steps,
         longest_stall_steps=0 if stretch is None else stretch[1] - stretch[0],
-        limit_joint=joint,
+        limit_joint=int(run.log.events[2]),
+        **numbers,
+    )
+
+
+def _history_of(run: LawRun) -> RunHistory:
+    """Arrays of a run over time."""
+    log, steps, rows, driven = run.log, run.steps, run.steps + 1, run.driven
+    before, after, views = log.fit[:rows].T
+    errors, read = log.errors[:rows], log.read[:rows]
+    if driven is not None:  # the log has the predicted rest of the robot instead of readings
+        read = _whole(driven.readings, rows)
+    s_star = run.scenario.ends.by_points().s_star
+    return RunHistory(
         q=log.q[:rows],
         q_read=None if np.array_equal(read, log.q[:rows]) else read,
         s=np.ascontiguousarray(log.s[:rows, :, : s_star.shape[1]]),
@@ -117,25 +158,9 @@ def trace_of(run: LawRun) -> Trace:
         views_used=views,
         q_dot=log.q_dot[:steps],
         speed_factor=log.factor[:steps],
-        self_occluded=log.hidden[:rows] > 0.5,
-        pose=poses.pose,
-        goal_pose=poses.goal_pose,
-        center=poses.center,
-        unplanned=run.unplanned,
-        **_incidences(run),
-        **_stated_mm(run),
-        untested=text((*untested, *lost), run.setup),
-        overruns=None if driven is None else driven.steered.overruns,
         force=None if driven is None or not driven.forces else _whole(driven.forces, rows),
         latency=None if driven is None else _whole(driven.delays, rows),
-        **({} if driven is None else driven.film.fields()),
     )
-
-
-# Numbers of a trace that are those of the summary of its run, and one more.
-_SUMMARY_FIELDS = [
-    field.name for field in flat_fields(Trace) if field.name in {*Summary._fields, "center_deviation_mm"}
-]
 
 
 def _whole(values: Sequence[FloatArray] | Sequence[float], rows: int) -> FloatArray:
@@ -201,11 +226,11 @@ def _rms(squares: FloatArray, count: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(mean))
 
 
-def _incidences(run: LawRun) -> dict[str, Any]:
-    """Names of the incidences, their errors at each time, px, and the freedoms that they leave."""
+def _incidences(run: LawRun) -> IncidenceHistory | None:
+    """Incidences, their errors at each time and the freedoms that they leave; None for a whole pose."""
     scenario, images = run.scenario, run.scenario.ends
     if not images.goal.incidences:
-        return {}
+        return None
     task, model = images.task(scenario.world.model), scenario.world.model
     seen, normal = undistort(model.lens, run.log.s), np.zeros((COORDINATES, COORDINATES + 1))
     H = np.full((run.steps + 1, 4, 4), math.nan)  # measured, as far as images show it
@@ -217,18 +242,18 @@ def _incidences(run: LawRun) -> dict[str, Any]:
     there = H[-1] if _credible(run) else np.full_like(H[-1], np.nan)
     left, each = _incidence_errors(run, images, there, taught), np.arange(len(taught))
     flats = [[one.tool for one in images.goal.incidences], [one.scene for one in images.goal.incidences]]
-    return {
-        "feature_s": images_of(model, task.body.M, flats[0], H),
-        "feature_s_star": images_of(model, task.body.M, flats[1], taught)[each, each],
-        "incidence_mm": np.hypot(left.mm, left.deviation_mm),
-        "incidence_deg": np.hypot(left.deg, left.deviation_deg),
-        "incidence_deviation_mm": left.deviation_mm,
-        "incidence_deviation_deg": left.deviation_deg,
-        "incidences": tuple(one.name for one in images.goal.incidences),
-        "incidence_px": errors_px(task.incidences, H),
-        "free_dof": run.plan.free_dof if isinstance(run.plan, Plan) else None,
+    return IncidenceHistory(
+        feature_s=images_of(model, task.body.M, flats[0], H),
+        feature_s_star=images_of(model, task.body.M, flats[1], taught)[each, each],
+        incidence_mm=np.hypot(left.mm, left.deviation_mm),
+        incidence_deg=np.hypot(left.deg, left.deviation_deg),
+        incidence_deviation_mm=left.deviation_mm,
+        incidence_deviation_deg=left.deviation_deg,
+        incidences=tuple(one.name for one in images.goal.incidences),
+        incidence_px=errors_px(task.incidences, H),
+        free_dof=run.plan.free_dof if isinstance(run.plan, Plan) else None,
         **_free(run, task, H[-1]),
-    }
+    )
 
 
 def _free(run: LawRun, task: Task, H: FloatArray) -> dict[str, Any]:

@@ -123,7 +123,7 @@ def filmed(trace, width, height):
             u, v = s[view, marker].round().astype(int)
             frames[view, max(0, v - 8) : v + 9, max(0, u - 8) : u + 9] = 200
         film.show(k, s, frames)
-    return replace(trace, **film.fields())
+    return replace(trace, frames=film.recorded())
 
 
 def known(config, true, model, q):

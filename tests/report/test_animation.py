@@ -1,10 +1,9 @@
 """What the 3D view shows, against the truth that the runs carry."""
 
-from dataclasses import replace
-
 import numpy as np
 
 from projservo_cli.geometry.kinematics import forward_kinematics
+from projservo_cli.records import changed
 from projservo_cli.report.animation import motion_of, write_view
 from projservo_cli.simulation.arm import camera_center
 from tests.configured import truth_of
@@ -17,7 +16,7 @@ def test_cameras_on_the_tool_move_past_a_scene_that_stands_still(tmp_path):
     truth, plant, trace = truth_of(config), material.plant, material.traces["exact"]
     model = truth.robot.model(truth.P, on_tool=True)
     goal = np.linalg.inv(forward_kinematics(model, trace.q[-1])) @ truth.robot.base_tool
-    traces = {"exact": replace(trace, goal_pose=goal)}
+    traces = {"exact": changed(trace, goal_pose=goal)}
     motion = motion_of(truth.robot, plant._replace(model=model), truth.M, material.plan, traces)
     run, centers = motion.runs["exact"], [camera_center(P) for P in truth.P]
     assert np.ptp(run.face, axis=0).max() == 0.0

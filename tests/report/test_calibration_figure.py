@@ -110,7 +110,7 @@ def test_runs_of_a_robot_without_a_model_are_reported_on_with_their_frames_and_t
     records = {"calibration": material.calibration, "observation": material.observation}
     blank = Run(tmp_path / "run.h5", to_yaml(config), {"calibrate": Result("", "", {}, {}, records)})
     keys = {step.name: step.key for step in steps_for(config, blank, ["servo"])}
-    filmed = {"": dataclasses.replace(trace, **film.fields())}
+    filmed = {"": dataclasses.replace(trace, frames=film.recorded())}
     made = {
         "calibrate": records,
         "plan": {"": material.plan},

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from projservo_cli.control.law import OK
 from projservo_cli.loop.verdicts import NO_PROGRESS, Instant, new_log, plateau_stretch, verdict_at
+from projservo_cli.records import changed
 from projservo_cli.report.claims import claims_of
 from tests.report.cases import SPECS, case
 from tests.scene import limits
@@ -38,7 +39,7 @@ def test_decay_is_judged_by_the_steps_after_the_limit_and_above_what_the_calibra
 
     def judged(way, theta):
         center = material.goal_center(trace) + way[:, None] * [0.6, 0.0, 0.8]
-        run = dataclasses.replace(trace, center=center, theta_s=theta, speed_factor=speed)
+        run = changed(trace, center=center, theta_s=theta, speed_factor=speed)
         return measured("directTWO: the control errors decay", own={FITTED: run})
 
     steps = [
@@ -83,7 +84,7 @@ def test_image_errors_are_held_against_an_exponential_and_the_least_before():
     e = np.full(trace.s_star.shape, 8.0) * decay[:, None, None, None]
     for risen, exponential, monotone in ((0.0, (0, False), (0, 0, False)), (70.0, (70, True), (1, 69, True))):
         e[3, 1, 2, 0] += risen
-        run = dataclasses.replace(trace, s=trace.s_star + e)
+        run = changed(trace, s=trace.s_star + e)
         text, holds = measured("does not decay exponentially", own={FREE: run})
         assert (int(re.search(r"(\d+) px", text)[1]), holds) == exponential
         text, holds = measured("does not even decay monotonically", own={FREE: run})

@@ -20,15 +20,15 @@ def test_frames_are_thinned_evenly_and_the_first_and_last_are_kept(looks):
     film, s = FrameRecorder(), np.arange(12.0).reshape(2, 3, 2)
     for k in range(looks):
         film.show(k, s + k, np.full((2, 8, 16), [[[k % 251]], [[255 - k % 251]]], dtype=np.uint8))
-    told = film.fields()
-    instant = told["frame_index"]
+    told = film.recorded()
+    instant = told.frame_index
     assert (instant[0], instant[-1]) == (0, looks - 1)
     assert min(looks, MOST_FRAMES // 2) <= len(instant) <= MOST_FRAMES
     ways = np.diff(instant)
     assert len(set(ways[:-1])) <= 1
     assert len(ways) < 2 or ways[-1] <= ways[0]
-    np.testing.assert_array_equal(told["frame_s"], [s + k for k in instant])
-    shown = frames_of(fake(Trace, **told))
+    np.testing.assert_array_equal(told.frame_s, [s + k for k in instant])
+    shown = frames_of(fake(Trace, **vars(told)))
     assert [film.shape for film in shown] == [(len(instant), 8, 16)] * 2
     assert shown[0].mean(axis=(1, 2)) == pytest.approx(instant % 251, abs=1.0)
     assert shown[1].mean(axis=(1, 2)) == pytest.approx(255 - instant % 251, abs=1.0)

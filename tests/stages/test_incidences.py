@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from projservo_cli.findings import REFUSES, Finding
-from projservo_cli.records import InputError, WorkFailed
+from projservo_cli.records import InputError, WorkFailed, changed
 from projservo_cli.report.animation import motion_of
 from projservo_cli.report.figures.scene import features_in_space
 from projservo_cli.report.report_data import REGISTER, Driven
@@ -108,7 +108,7 @@ def test_features_of_tool_and_scene_are_drawn_where_they_are():
         assert sum(line.get_label().startswith("features of the ") for line in axes.lines) == 3
     assert drawn.axes[2].get_title().startswith("pin on hole\nwithin 0.")
     # A motion of a sequence has incidences of its own, and panels for them.
-    approach = replace(trace, incidences=("pin on hole (back)", "tip on bottom (back)"))
+    approach = changed(trace, incidences=("pin on hole (back)", "tip on bottom (back)"))
     drawn = figure.drawn(figure.data(replace(material, traces={"exact_track": trace, "before": approach})))
     titles = [axes.get_title().split("\n")[0] for axes in drawn.axes[2:]]
     assert titles == [*trace.incidences, *approach.incidences]

@@ -9,7 +9,7 @@ import numpy as np
 from projservo_cli.geometry.kinematics import project
 from projservo_cli.laws import BODY_LAWS, POINT_LAWS, title_of
 from projservo_cli.loop.verdicts import plateau_stretches
-from projservo_cli.records import CORNERS, ByteArray, FloatArray, IntArray, Trace
+from projservo_cli.records import CORNERS, ByteArray, FloatArray, IncidenceHistory, IntArray, Trace
 from projservo_cli.report import panels, style
 from projservo_cli.report.report_data import DIRECT, Data, Driven, ReportData, percent, registered, title
 from projservo_cli.task.face import cyclic_order
@@ -268,15 +268,15 @@ def frames_of(
     """
     from PIL import Image
 
-    if trace.frame_jpeg is None or trace.frame_size is None:
+    if (kept := trace.frames) is None:
         return None
-    ends = np.cumsum(trace.frame_size).reshape(trace.frame_size.shape)
+    ends = np.cumsum(kept.frame_size).reshape(kept.frame_size.shape)
     films = []
-    for ends_of_view, sizes in zip(ends.T, trace.frame_size.T, strict=True):
+    for ends_of_view, sizes in zip(ends.T, kept.frame_size.T, strict=True):
         film = []
         for k in np.arange(len(sizes)) if selected is None else selected:
             end, size = ends_of_view[k], sizes[k]
-            image = Image.open(io.BytesIO(trace.frame_jpeg[end - size : end].tobytes()), formats=["JPEG"])
+            image = Image.open(io.BytesIO(kept.frame_jpeg[end - size : end].tobytes()), formats=["JPEG"])
             if width is not None and image.width > width:
                 image.draft("L", (width, width * image.height // image.width))
             film.append(np.asarray(image.convert("L")))
@@ -284,14 +284,14 @@ def frames_of(
     return films
 
 
-def _runs_with(report_data: Driven | ReportData, field: str) -> list[tuple[str, Trace]]:
-    """Names and traces of the runs that have an array, first those of the direct laws."""
-    runs = [run for run in report_data.traces.items() if getattr(run[1], field) is not None]
+def _runs_with(report_data: Driven | ReportData, part: str) -> list[tuple[str, Trace]]:
+    """Names and traces of the runs that have a part, first those of the direct laws."""
+    runs = [run for run in report_data.traces.items() if getattr(run[1], part) is not None]
     return sorted(runs, key=lambda run: run[0] not in BODY_LAWS)
 
 
 def _filmed(report_data: Driven | ReportData) -> bool:
-    return bool(_runs_with(report_data, "frame_index"))
+    return bool(_runs_with(report_data, "frames"))
 
 
 def _data_frames(report_data: Driven | ReportData) -> Data:
@@ -300,21 +300,21 @@ def _data_frames(report_data: Driven | ReportData) -> Data:
     The run is one of those with frames.
     """
     order = cyclic_order(report_data.plan.A)
-    name, trace = _runs_with(report_data, "frame_index")[0]
-    assert trace.frame_index is not None
-    assert trace.frame_s is not None
-    half = np.abs(trace.image_error[trace.frame_index] - 0.5 * trace.image_error[0])
+    name, trace = _runs_with(report_data, "frames")[0]
+    kept = trace.frames
+    assert kept is not None
+    half = np.abs(trace.image_error[kept.frame_index] - 0.5 * trace.image_error[0])
     selected = np.array([0, int(np.nanargmin(half)), len(half) - 1])
     frames = frames_of(trace, selected)
     assert frames is not None
     return {
         "run": np.array(f"{title(name)}, {trace.verdict}"),
-        "instant": trace.frame_index[selected],
+        "instant": kept.frame_index[selected],
         "period_s": np.array(trace.period),
-        "found": trace.frame_s[selected],
+        "found": kept.frame_s[selected],
         "s": trace.s[:, :, order],
         "s_star": trace.s_star[:, order],
-        **_feature_images(trace, trace.frame_index[selected]),
+        **_feature_images(trace.of_incidences, kept.frame_index[selected]),
         **{f"frames_{view}": film for view, film in enumerate(frames)},
         "view": np.array(trace.view),
     }
@@ -373,11 +373,11 @@ _LEAST_ASPECT = 0.55  # height over width of an image of features
 _PANELS = 4  # most panels of errors in a row
 
 
-def _feature_images(trace: Trace, instants: IntArray) -> Data:
+def _feature_images(found: IncidenceHistory | None, instants: IntArray) -> Data:
     """Images of the features of the tool at instants (k,) and of those of the scene; none for a pose."""
-    if trace.feature_s is None or trace.feature_s_star is None:
+    if found is None:
         return {}
-    return {"feature": trace.feature_s[instants], "feature_there": trace.feature_s_star}
+    return {"feature": found.feature_s[instants], "feature_there": found.feature_s_star}
 
 
 def _data_incidences(report_data: ReportData | Driven) -> Data:
@@ -385,33 +385,36 @@ def _data_incidences(report_data: ReportData | Driven) -> Data:
 
     Motions of a sequence have incidences of their own: what a run does not ask for is NaN.
     """
-    name, shown = _runs_with(report_data, "feature_s")[0]
+    name, shown = _runs_with(report_data, "of_incidences")[0]
+    there = shown.of_incidences
+    assert there is not None
     result: Data = {
         "run": np.array(title(name)),
-        "free_dof": np.array(-1 if shown.free_dof is None else shown.free_dof),
+        "free_dof": np.array(-1 if there.free_dof is None else there.free_dof),
         "face": shown.s[[0, -1]][:, :, cyclic_order(report_data.plan.A)],
         "face_at_end": shown.s[-1],
         "view": np.array(shown.view),
-        **_feature_images(shown, np.array([0, -1])),
-        **{key: free for key in ("free_motion", "free_s") if (free := getattr(shown, key)) is not None},
+        **_feature_images(there, np.array([0, -1])),
+        **{key: free for key in ("free_motion", "free_s") if (free := getattr(there, key)) is not None},
     }
-    asking = {name: trace for name, trace in report_data.traces.items() if trace.incidence_px is not None}
-    each = list(dict.fromkeys(name for trace in asking.values() for name in trace.incidences))
+    every = {name: trace.of_incidences for name, trace in report_data.traces.items()}
+    asking = {name: found for name, found in every.items() if found is not None}
+    each = list(dict.fromkeys(name for found in asking.values() for name in found.incidences))
     result["incidence"] = np.array(each)
     stated = result["incidence_mm"], result["incidence_deg"] = np.full((2, len(each)), np.nan)
-    for name, trace in [*asking.items(), ("", shown)]:
-        own = [each.index(incidence) for incidence in trace.incidences]
-        for all_stated, one in zip(stated, (trace.incidence_mm, trace.incidence_deg), strict=True):
-            all_stated[own] = np.nan if one is None else one
-        if name and trace.incidence_px is not None:
-            result[f"t_s_{name}"] = trace.period * np.arange(len(trace.incidence_px))
-            result[f"px_{name}"] = np.full((len(trace.incidence_px), len(each)), np.nan)
-            result[f"px_{name}"][:, own] = trace.incidence_px
+    for name, found in [*asking.items(), ("", there)]:
+        own = [each.index(incidence) for incidence in found.incidences]
+        for all_stated, one in zip(stated, (found.incidence_mm, found.incidence_deg), strict=True):
+            all_stated[own] = one
+        if name:
+            result[f"t_s_{name}"] = report_data.traces[name].period * np.arange(len(found.incidence_px))
+            result[f"px_{name}"] = np.full((len(found.incidence_px), len(each)), np.nan)
+            result[f"px_{name}"][:, own] = found.incidence_px
     return result
 
 
 def _of_features(report_data: Driven | ReportData) -> bool:
-    return bool(_runs_with(report_data, "feature_s"))
+    return bool(_runs_with(report_data, "of_incidences"))
 
 
 @registered(
@@ -550,7 +553,8 @@ def _data_object(report_data: ReportData | Driven) -> Data:
 
 
 def _carried(report_data: Driven | ReportData) -> bool:
-    return report_data.plan.s_object_taught is not None
+    carried = report_data.plan.carried
+    return carried is not None and carried.s_object_taught is not None
 
 
 @registered(

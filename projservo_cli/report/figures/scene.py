@@ -97,14 +97,8 @@ def features_in_space(plant: Plant, traces: Mapping[str, Trace]) -> tuple[FloatA
     They are where the true cameras see what was measured; None of a whole pose, by one camera, and of
     cameras that move.
     """
-    shown = next((trace for trace in traces.values() if trace.feature_s is not None), None)
-    if (
-        shown is None
-        or shown.feature_s is None
-        or shown.feature_s_star is None
-        or len(plant.model.P) < 2
-        or plant.model.on_tool
-    ):
+    shown = next((found for trace in traces.values() if (found := trace.of_incidences) is not None), None)
+    if shown is None or len(plant.model.P) < 2 or plant.model.on_tool:
         return None
     pixels = np.stack([shown.feature_s[0], shown.feature_s_star])
     straight = undistort(plant.model.lens, np.moveaxis(pixels, -2, 0).reshape(len(plant.model.P), -1, 2))
