@@ -416,26 +416,26 @@ class Observation:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class ProjectiveKinematics:
-    """Robot and cameras in one projective frame, with the errors of all their numbers.
+class Rig(Part):
+    """Cameras in the projective frame."""
 
-    Points are scaled to ``a_inf @ M = 1``, so that the mean of points is their midpoint.
-    """
-
-    view: tuple[str, ...] = _scalar(about="names of the views", default=VIEWS)
     mount: str = _scalar(
         about="world: cameras stand still and watch the tool; tool: the reverse", default=WORLD
     )
-    joint_types: str = _scalar(about="one letter a joint, R or P")
     P: FloatArray = _array("view image_row coordinate", "px", "cameras, projective frame")
-    H_hat_0: FloatArray = _array("joint row coordinate", about="joint operators at the reference")
-    q_reference: FloatArray = _array("joint", "rad or m", "joint reading at the reference")
-    a_inf: FloatArray = _array("coordinate", about="common plane at infinity")
-    marker: IntArray = _array("marker", about="number of the marker")
-    M: FloatArray = _array("marker coordinate", about="markers at the reference, a_inf @ M = 1")
     lens: FloatArray | None = _optional_array(
         "view lens_term", about="radial distortion, if estimated: image centre u, v and radius in px, k1, k2"
     )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Arm(Part):
+    """Joints in the projective frame."""
+
+    joint_types: str = _scalar(about="one letter a joint, R or P")
+    H_hat_0: FloatArray = _array("joint row coordinate", about="joint operators at the reference")
+    q_reference: FloatArray = _array("joint", "rad or m", "joint reading at the reference")
+    a_inf: FloatArray = _array("coordinate", about="common plane at infinity")
     joint_curve: FloatArray | None = _optional_array(
         "joint_curve_row joint_curve_column",
         about="terms of true joints less readings, if fitted: index into BASIS, joint moved and joint read "
@@ -447,7 +447,38 @@ class ProjectiveKinematics:
         about="arm by which torques are known: of each joint its twist over a weight on its axis, at last "
         "gravity in the first row over the weight at the tool",
     )
-    # The covariance of all these, as ``Errors`` says; of a method without one they are not finite.
+
+    @property
+    def prismatic(self) -> BoolArray:
+        """Whether each joint (n,) is prismatic."""
+        return prismatic_of(self.joint_types)
+
+    @property
+    def curve(self) -> JointCurve | None:
+        """True joints by readings, in the order of the arm; None where they are equal."""
+        if self.joint_curve is None:
+            return None
+        terms = self.joint_curve[:, :4] - FROM_ONE
+        return JointCurve(terms, NO_CURVE.arm if self.joint_curve_arm is None else self.joint_curve_arm)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Body(Part):
+    """Markers in the projective frame, scaled to ``a_inf @ M = 1``: their mean is their midpoint."""
+
+    marker: IntArray = _array("marker", about="number of the marker")
+    M: FloatArray = _array("marker coordinate", about="markers at the reference, a_inf @ M = 1")
+
+    def indices_of(self, numbers: Iterable[int]) -> list[int]:
+        """Return indices of markers in ``marker`` and ``M`` by their numbers; ValueError if unknown."""
+        known = self.marker.tolist()
+        return [known.index(number) for number in numbers]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ParameterErrors(Part):
+    """Covariance of rig, arm and body, as ``Errors`` says; of a method without one it is not finite."""
+
     sqrt_cov_shared: FloatArray = _array(
         "parameter error",
         about="square root of the covariance of P.ravel(), H_hat_0.ravel() and, if estimated, k1, k2 and "
@@ -462,59 +493,34 @@ class ProjectiveKinematics:
     )
 
     @property
-    def prismatic(self) -> BoolArray:
-        """Whether each joint (n,) is prismatic."""
-        return prismatic_of(self.joint_types)
-
-    def model(self) -> Model:
-        """The kernels' view of the calibration."""
-        on_tool = self.mount == TOOL
-        return Model(
-            P=self.P,
-            H_hat_0=-self.H_hat_0 if on_tool else self.H_hat_0,
-            prismatic=self.prismatic,
-            q_reference=self.q_reference,
-            a_inf=self.a_inf,
-            lens=no_lenses(len(self.P)) if self.lens is None else self.lens,
-            on_tool=on_tool,
-            curve=self.curve or NO_CURVE,
-        )
-
-    @property
     def errors(self) -> Errors:
         """Errors of P, H_hat_0, lenses and M, in this order."""
         return Errors(self.sqrt_cov_shared, self.sqrt_cov_marker, self.sqrt_cov_own)
-
-    @property
-    def lens_terms(self) -> int:
-        """Number of estimated terms of each lens: 0, k1 and k2, or those and the image centre u, v."""
-        if self.lens is None:
-            return 0
-        of_curve = 0 if self.joint_curve is None else len(self.joint_curve)
-        return (len(self.sqrt_cov_shared) - self.P.size - self.H_hat_0.size - of_curve) // len(self.P)
-
-    @property
-    def curve(self) -> JointCurve | None:
-        """True joints by readings, in the order of the arm; None where they are equal."""
-        if self.joint_curve is None:
-            return None
-        terms = self.joint_curve[:, :4] - FROM_ONE
-        return JointCurve(terms, NO_CURVE.arm if self.joint_curve_arm is None else self.joint_curve_arm)
 
     @property
     def has_covariance(self) -> bool:
         """Whether it says how far it is off; that of a truth, which is not off, does not."""
         return bool(np.isfinite(self.sqrt_cov_shared).all())
 
-    def indices_of(self, numbers: Iterable[int]) -> list[int]:
-        """Return indices of markers in ``marker`` and ``M`` by their numbers; ValueError if unknown."""
-        known = self.marker.tolist()
-        return [known.index(number) for number in numbers]
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class JointEvidence(Part):
+    """How well each joint is determined, and where its readings were."""
+
+    excitation: FloatArray = _array("joint", "rad or m", "range of joint motion in the data")
+    joint_min: FloatArray = _array("joint", "rad or m", "minimum joint reading in the data")
+    poorly_observable: BoolArray = _array("joint", about="joints whose operator the data hardly determine")
+    operator_defect: FloatArray = _array("joint", about="norm of Ĥ³ + Ĥ (revolute) or Ĥ² (prismatic) over Ĥ")
+    trace_defect: FloatArray = _array("joint", about="absolute trace of Ĥ")
+    plane_defect: FloatArray = _array("joint", about="norm of a_inf @ Ĥ, a_inf of unit norm")
+    prediction_noise: FloatArray = _array(
+        "joint", about="noise of predicted images 0.5 rad or 0.15 m from the reference, over the pixel noise"
+    )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class FitQuality:
-    """Evidence of a calibration: its residuals, their noise, and how well each joint is determined."""
+class FitQuality(Part):
+    """Evidence of a calibration: its residuals and their noise."""
 
     rms_px: float = _scalar("px", "reprojection residual, rms per marker and view (Euclidean)")
     sigma_px: float = _scalar("px", "noise per image coordinate: configured, given or estimated")
@@ -543,21 +549,12 @@ class FitQuality:
         "limit", "rad", "95 % interval of sigma_q, if estimated"
     )
     encoder_counts: bool = _scalar(about="whether sigma_q is that of encoder counts", default=False)
-    excitation: FloatArray = _array("joint", "rad or m", "range of joint motion in the data")
-    joint_min: FloatArray = _array("joint", "rad or m", "minimum joint reading in the data")
-    poorly_observable: BoolArray = _array("joint", about="joints whose operator the data hardly determine")
-    operator_defect: FloatArray = _array("joint", about="norm of Ĥ³ + Ĥ (revolute) or Ĥ² (prismatic) over Ĥ")
-    trace_defect: FloatArray = _array("joint", about="absolute trace of Ĥ")
-    plane_defect: FloatArray = _array("joint", about="norm of a_inf @ Ĥ, a_inf of unit norm")
-    prediction_noise: FloatArray = _array(
-        "joint", about="noise of predicted images 0.5 rad or 0.15 m from the reference, over the pixel noise"
-    )
     poses_used: int = _scalar(about="number of poses in the fit")
     markers_used: int = _scalar(about="number of markers in the fit")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Rejections:
+class Rejections(Part):
     """Data that a calibration left out or read otherwise than they were written, or that decide nothing."""
 
     outlier: IntArray = _array(
@@ -605,7 +602,7 @@ class Rejections:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class StatedErrors:
+class StatedErrors(Part):
     """Errors of predicted images, with the deviations from the model that limit them."""
 
     predicted_rms_px: float | None = _optional_scalar(
@@ -640,14 +637,34 @@ class StatedErrors:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Calibration(StatedErrors, Rejections, FitQuality, ProjectiveKinematics):
-    """Projective kinematics of a robot seen by a stereo rig of unknown calibration.
+class TimeOffset(Part):
+    """Time of joint readings less that of images, if poses in motion determine it."""
 
-    Points are scaled to ``a_inf @ M = 1``, so that the mean of points is their midpoint.
-    """
+    time_offset_s: FloatArray = _array("view", "s", "time of a joint reading less the time of its image")
+    time_offset_interval_s: FloatArray = _array("view limit", "s", "95 % interval of the time offset")
+    time_offset_jitter_s: FloatArray = _array(
+        "view", "s", "standard deviation of the time offset of single images"
+    )
 
-    method: str = _scalar(about="bundle_adjustment, maximum likelihood")
-    source: str = _scalar(about="simulated or recorded")
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Refits(Part):
+    """Cameras that were fitted again."""
+
+    refit: tuple[str, ...] = _scalar(
+        about="names of cameras that were fitted again, in this order", default=()
+    )
+    refit_numbers: FloatArray = _array(
+        "refit refit_column",
+        about="of each the number of poses, and the error of its images within the joint ranges now and "
+        "before it moved, rms px",
+    )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CalibrationVerdict(Part):
+    """Whether a calibration is usable, and what limits it."""
+
     usable: bool = _scalar(about="whether the calibration is usable for control")
     reason: str = _scalar(about="reason why it is usable or not")
     advice: tuple[str, ...] = _scalar(about="remedies, one sentence each")
@@ -656,25 +673,6 @@ class Calibration(StatedErrors, Rejections, FitQuality, ProjectiveKinematics):
     findings: tuple[Finding, ...] = _scalar(
         about="what is off: code, severity, subject, amount, deviation, limit, unit, effect",
         default=(),
-    )
-    seconds: float = _scalar("s", "computing time")
-    time_offset_s: FloatArray | None = _optional_array(
-        "view", "s", "time of a joint reading less the time of its image"
-    )
-    time_offset_interval_s: FloatArray | None = _optional_array(
-        "view limit", "s", "95 % interval of the time offset"
-    )
-    time_offset_jitter_s: FloatArray | None = _optional_array(
-        "view", "s", "standard deviation of the time offset of single images"
-    )
-
-    refit: tuple[str, ...] = _scalar(
-        about="names of cameras that were fitted again, in this order", default=()
-    )
-    refit_numbers: FloatArray | None = _optional_array(
-        "refit refit_column",
-        about="of each the number of poses, and the error of its images within the joint ranges now and "
-        "before it moved, rms px",
     )
 
     @property
@@ -687,13 +685,61 @@ class Calibration(StatedErrors, Rejections, FitQuality, ProjectiveKinematics):
         """The deviation that these data do not show and that would spoil predictions most."""
         return next((one.others[0] for one in self.findings if one.code == "unshown"), None)
 
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Calibration(Composite):
+    """Projective kinematics of a robot seen by a stereo rig of unknown calibration.
+
+    Points are scaled to ``a_inf @ M = 1``, so that the mean of points is their midpoint.
+    """
+
+    view: tuple[str, ...] = _scalar(about="names of the views", default=VIEWS)
+    method: str = _scalar(about="bundle_adjustment, maximum likelihood")
+    source: str = _scalar(about="simulated or recorded")
+    seconds: float = _scalar("s", "computing time")
+    rig: Rig
+    arm: Arm
+    body: Body
+    parameter_errors: ParameterErrors
+    verdict: CalibrationVerdict
+    fit: FitQuality
+    joints: JointEvidence
+    rejections: Rejections
+    stated: StatedErrors
+    time_offset: TimeOffset | None = None
+    refits: Refits | None = None
+
+    def model(self) -> Model:
+        """The kernels' view of the calibration."""
+        rig, arm, on_tool = self.rig, self.arm, self.rig.mount == TOOL
+        return Model(
+            P=rig.P,
+            H_hat_0=-arm.H_hat_0 if on_tool else arm.H_hat_0,
+            prismatic=arm.prismatic,
+            q_reference=arm.q_reference,
+            a_inf=arm.a_inf,
+            lens=no_lenses(len(rig.P)) if rig.lens is None else rig.lens,
+            on_tool=on_tool,
+            curve=arm.curve or NO_CURVE,
+        )
+
+    @property
+    def lens_terms(self) -> int:
+        """Number of estimated terms of each lens: 0, k1 and k2, or those and the image centre u, v."""
+        if self.rig.lens is None:
+            return 0
+        of_curve = 0 if self.arm.joint_curve is None else len(self.arm.joint_curve)
+        return (
+            len(self.parameter_errors.sqrt_cov_shared) - self.rig.P.size - self.arm.H_hat_0.size - of_curve
+        ) // len(self.rig.P)
+
     def without_covariance(self) -> "Calibration":
         """The same, which takes little memory, for those who do not ask how far it is off."""
         none = {
             name: getattr(self, name)[..., :0]
             for name in ("sqrt_cov_shared", "sqrt_cov_marker", "sqrt_cov_own")
         }
-        return replace(self, **none)
+        return changed(self, **none)
 
     def with_markers(self, indices: IntArray | list[int]) -> "Calibration":
         """The same with some of the markers, by their indices."""
@@ -702,7 +748,7 @@ class Calibration(StatedErrors, Rejections, FitQuality, ProjectiveKinematics):
             first = len(bias) - self.M.size
             of_markers = bias[first:].reshape(len(self.M), 4, -1)[indices]
             bias = np.concatenate([bias[:first], of_markers.reshape(-1, bias.shape[1])])
-        return replace(
+        return changed(
             self,
             model_error_bias=bias,
             marker=self.marker[indices],

@@ -59,7 +59,7 @@ from projservo_cli.calibration.robust_fit import (
 )
 from projservo_cli.calibration.time_offset import with_time_offset
 from projservo_cli.calibration.views import with_all_views, with_best_pair, with_own_noise
-from projservo_cli.findings import LIMITS, REFUSES, Finding, Subject
+from projservo_cli.findings import LIMITS, REFUSES, Finding, Subject, columns
 from projservo_cli.geometry.lens import K1
 from projservo_cli.image_size import ImageSize, border_distance, image_sizes
 from projservo_cli.records import (
@@ -67,12 +67,22 @@ from projservo_cli.records import (
     TOOL,
     WHY_LOST,
     WORLD,
+    Arm,
+    Body,
     Calibration,
     Errors,
+    FitQuality,
     FloatArray,
     InputError,
+    IntArray,
     JointCurve,
+    JointEvidence,
     Observation,
+    ParameterErrors,
+    Rejections,
+    Rig,
+    StatedErrors,
+    changed,
     letters_of,
 )
 from projservo_cli.words import judged, with_findings
@@ -203,7 +213,7 @@ def calibrate(
             standing_too = np.column_stack([numbers, np.full(len(numbers), WHY_LOST.index("still"))])
             known = standing_too[:0] if result.rejected_markers is None else result.rejected_markers
             lost = np.concatenate([known, standing_too])
-            result = dataclasses.replace(with_findings(result, of_still), rejected_markers=lost)
+            result = changed(with_findings(result, of_still), rejected_markers=lost)
         seconds = time.perf_counter() - begin
         if fitted is not None:
             fitted(solution, expected.noise_px(solution))
@@ -298,7 +308,7 @@ def _maximum_likelihood(
         ahead.append(Finding("exact_images", LIMITS, amount=epipolar.sigma_px, unit="px"))
     result = with_findings(result, filter(None, [_worst_view(result), note]), ahead)
     if curved is not None and result.joint_curve is not None:
-        result = dataclasses.replace(result, joint_curve=np.hstack([result.joint_curve[:, :5], curved.gains]))
+        result = changed(result, joint_curve=np.hstack([result.joint_curve[:, :5], curved.gains]))
     return solution, expected, result
 
 
@@ -354,7 +364,7 @@ def _refined(
     outlier = outlier[np.lexsort(outlier.T[::-1])]
     lost = rejection_reasons(whole, kept)
     lost[:, 0] = detections.marker[lost[:, 0]]
-    return with_findings(dataclasses.replace(record, outlier=outlier, rejected_markers=lost), more)
+    return with_findings(changed(record, outlier=outlier, rejected_markers=lost), more)
 
 
 def _of_lens(calibration: Calibration, centered: bool) -> Iterator[Finding]:
@@ -402,18 +412,45 @@ def _record(
     if check is not None and check.noise_px > 0.0:
         factor = check.noise_factor * check.predicted_px / check.noise_px
     off = result.errors(solution, errors).scaled(factor * expected.noise_px(solution))
-    operator_defect, trace_defect, plane_defect = result.defects()
-    corner_squares, corner_q = solution.corners()
-    used_rows, joint_noise = solution.used.any(axis=0), solution.joint_noise
-    # Residuals beyond noise are an error of the model.
-    over = solution.sigma_px**2 - expected.sigma_px**2 if expected.warns(solution) else 0.0
+    about_all = judged(findings, detections.setup)
     return Calibration(
         method=METHOD,
         source="",
         view=detections.view,
-        mount=detections.mount,
-        joint_types=letters_of(detections.prismatic),
-        **judged(findings, detections.setup),
+        seconds=0.0,
+        rig=Rig(mount=detections.mount, P=params.P, lens=params.lens),
+        arm=Arm(
+            joint_types=letters_of(detections.prismatic),
+            H_hat_0=params.H_hat,
+            q_reference=problem.q_reference,
+            a_inf=result.a_inf,
+            **_curve_fields(params.curve, off),
+        ),
+        body=Body(marker=detections.marker, M=params.M),
+        parameter_errors=ParameterErrors(
+            sqrt_cov_shared=off.shared, sqrt_cov_marker=off.marker, sqrt_cov_own=off.own
+        ),
+        verdict=about_all,
+        fit=_quality(solution, expected),
+        joints=_joint_evidence(result, detections, verdict.span, verdict.noise),
+        rejections=_rejections(detections, found, outlier),
+        stated=StatedErrors(
+            predicted_rms_px=verdict.error[0],
+            predicted_p99_px=verdict.error[1],
+            **columns(about_all.findings),
+            **({} if check is None else _model_fields(result, solution, check)),
+        ),
+    )
+
+
+def _quality(solution: Solution, expected: Expected) -> FitQuality:
+    """Residuals of a fit, and the noise that they show."""
+    corner_squares, corner_q = solution.corners()
+    used_rows, joint_noise = solution.used.any(axis=0), solution.joint_noise
+    detections = solution.problem.detections
+    # Residuals beyond noise are an error of the model.
+    over = solution.sigma_px**2 - expected.sigma_px**2 if expected.warns(solution) else 0.0
+    return FitQuality(
         rms_px=solution.rms_px,
         sigma_px=expected.sigma_px,
         corner_squares=corner_squares,
@@ -421,27 +458,37 @@ def _record(
         sigma_scale=expected.scale,
         sigma_scale_interval=expected.scale_interval,
         sigma_fitted_px=solution.sigma_px,
+        sigma_view_px=_noise_of_views(solution),
         chi2_per_dof=expected.ratio(solution) ** 2,
         dof=solution.dof,
-        seconds=0.0,
-        P=params.P,
-        H_hat_0=params.H_hat,
-        q_reference=problem.q_reference,
-        a_inf=result.a_inf,
-        marker=detections.marker,
-        M=params.M,
-        sqrt_cov_shared=off.shared,
-        sqrt_cov_marker=off.marker,
-        sqrt_cov_own=off.own,
-        excitation=verdict.span,
+        poses_used=int(np.unique(detections.pose_of[used_rows]).size),
+        markers_used=int(np.unique(detections.marker_of[used_rows]).size),
+        sigma_q=None if joint_noise is None else joint_noise.sigma_q,
+        sigma_q_interval=None if joint_noise is None else joint_noise.interval,
+        encoder_counts=joint_noise is not None and joint_noise.ticks,
+        model_px=float(np.sqrt(over)),
+    )
+
+
+def _joint_evidence(
+    result: Projective, detections: Detections, span: FloatArray, noise: FloatArray
+) -> JointEvidence:
+    """How well the data of a fit determine its joints, by their span and the noise of predictions, (n,)."""
+    operator_defect, trace_defect, plane_defect = result.defects()
+    return JointEvidence(
+        excitation=span,
         joint_min=detections.q[np.unique(detections.pose_of)].min(axis=0),
-        poorly_observable=verdict.noise > WEAK_NOISE,
+        poorly_observable=noise > WEAK_NOISE,
         operator_defect=operator_defect,
         trace_defect=trace_defect,
         plane_defect=plane_defect,
-        prediction_noise=verdict.noise,
-        poses_used=int(np.unique(detections.pose_of[used_rows]).size),
-        markers_used=int(np.unique(detections.marker_of[used_rows]).size),
+        prediction_noise=noise,
+    )
+
+
+def _rejections(detections: Detections, found: Outliers, outlier: IntArray) -> Rejections:
+    """Detections that a fit left out, with what explains them."""
+    return Rejections(
         outlier=outlier,
         suspect=np.stack(
             [detections.pose[found.suspect[:, 0]], detections.numbers[found.suspect[:, 1]]], axis=1
@@ -451,16 +498,6 @@ def _record(
         id_switches=np.concatenate(
             [detections.pose[found.id_switches[:, :1]], detections.marker[found.id_switches[:, 1:]]], axis=1
         ),
-        predicted_rms_px=verdict.error[0],
-        predicted_p99_px=verdict.error[1],
-        lens=params.lens,
-        sigma_view_px=_noise_of_views(solution),
-        sigma_q=None if joint_noise is None else joint_noise.sigma_q,
-        sigma_q_interval=None if joint_noise is None else joint_noise.interval,
-        encoder_counts=joint_noise is not None and joint_noise.ticks,
-        model_px=float(np.sqrt(over)),
-        **_curve_fields(params.curve, off),
-        **({} if check is None else _model_fields(result, solution, check)),
     )
 
 

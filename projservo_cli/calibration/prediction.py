@@ -4,7 +4,7 @@ It has the equations of the kernels in ``geometry`` for all poses and points tog
 predictions and random tasks.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import reduce
 from typing import Any, NamedTuple
 
@@ -24,6 +24,7 @@ from projservo_cli.records import (
     IntArray,
     JointCurve,
     apart,
+    changed,
 )
 
 # Number of parameters of a camera, a 3×4 matrix.
@@ -236,7 +237,7 @@ def parameters_from(calibration: Calibration) -> Parameters:
 
 def errors_of(calibration: Calibration) -> Errors:
     """Errors of the parameters of a calibration, in their order."""
-    errors = calibration.errors
+    errors = calibration.parameter_errors.errors
     if calibration.mount == TOOL:
         errors = errors._replace(shared=errors.shared[_in_reverse(calibration)])
     return errors
@@ -266,7 +267,7 @@ def along_the_arm(c: Calibration) -> Calibration:
     if bias is not None:
         bias = np.concatenate([bias[rows], bias[len(rows) :]])
     per_joint: dict[str, Any] = {name: np.ascontiguousarray(getattr(c, name)[::-1]) for name in _PER_JOINT}
-    return replace(
+    return changed(
         c,
         **per_joint,
         joint_types=c.joint_types[::-1],

@@ -53,8 +53,10 @@ from projservo_cli.records import (
     InputError,
     IntArray,
     Observation,
+    Refits,
     WorkFailed,
     apart,
+    changed,
 )
 from projservo_cli.words import failed, with_findings
 
@@ -485,19 +487,19 @@ def _record(
         for k, j in enumerate(which):
             marker[j, :, first + 3 * k : first + 3 * k + 3] = own_errors[j]
         own_errors[which] = 0.0
-    changed: dict[str, Any] = {"P": camera.params.P, "lens": camera.params.lens}
-    changed |= {"sqrt_cov_shared": shared, "sqrt_cov_marker": marker, "sqrt_cov_own": own_errors}
+    fields: dict[str, Any] = {"P": camera.params.P, "lens": camera.params.lens}
+    fields |= {"sqrt_cov_shared": shared, "sqrt_cov_marker": marker, "sqrt_cov_own": own_errors}
     if c.model_error_bias is not None:
-        changed["model_error_bias"] = _bias(c, camera)
+        fields["model_error_bias"] = _bias(c, camera)
     if c.corner_squares is not None and c.corner_q is not None:
         squares = np.full((len(found.q), *c.corner_squares.shape[1:]), np.nan)
         square = np.square(images.problem.residual(camera.params)).mean(axis=-1)
         squares[found.pose_of, v, which[found.marker_of]] = np.where(camera.used[v], square[v], np.nan)
         old = c.corner_squares.copy()
         old[:, v] = np.nan
-        changed["corner_squares"] = np.concatenate([old, squares])
-        changed["corner_q"] = np.concatenate([c.corner_q, observation.at_rest.q])
-    new = dataclasses.replace(c, **changed)
+        fields["corner_squares"] = np.concatenate([old, squares])
+        fields["corner_q"] = np.concatenate([c.corner_q, observation.at_rest.q])
+    new = changed(c, **fields)
     pixels = found.pixels[v, camera.used[v]]
     low, high = pixels.min(axis=0), pixels.max(axis=0)
     wide = 0.5 * (high - low)
@@ -511,7 +513,7 @@ def _bias(c: Calibration, camera: _Camera) -> FloatArray:
     images, v, s = camera.images, camera.v, len(c.sqrt_cov_shared)
     bias = np.array(c.model_error_bias)
     by_marker = bias[s:].reshape(len(c.M), 4, -1)[images.which]
-    of_bias = dataclasses.replace(
+    of_bias = changed(
         images.calibration,
         sqrt_cov_shared=bias[:s],
         sqrt_cov_marker=by_marker,
@@ -545,6 +547,9 @@ def _judged(c: Calibration, v: int, error: list[float], pose_of: IntArray, limit
         if (px := getattr(c, field)) is not None:
             grown[field] = float(np.sqrt(max(px**2 + (now**2 - before**2) / len(c.view), 0.0)))
     numbers = np.array([[poses, now, before]])
-    numbers = numbers if c.refit_numbers is None else np.concatenate([c.refit_numbers, numbers])
-    c = dataclasses.replace(c, refit=(*c.refit, name), refit_numbers=numbers, **grown)
+    refits = Refits(refit=(name,), refit_numbers=numbers)
+    if (old := c.refits) is not None:
+        numbers = np.concatenate([old.refit_numbers, numbers])
+        refits = Refits(refit=(*old.refit, name), refit_numbers=numbers)
+    c = changed(c, refits=refits, **grown)
     return with_findings(c, (), [told] if now > min(limit, _MORE * before) else [])

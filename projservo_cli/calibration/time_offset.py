@@ -16,7 +16,7 @@ from scipy.special import stdtrit
 from projservo_cli.calibration.detections import MAD, per_rad
 from projservo_cli.calibration.prediction import joint_derivative, predict
 from projservo_cli.findings import LIMITS, Finding, Subject
-from projservo_cli.records import Calibration, FloatArray, InputError, IntArray, Observation
+from projservo_cli.records import Calibration, FloatArray, InputError, IntArray, Observation, TimeOffset
 from projservo_cli.words import with_findings
 
 # Minimum time offset searched, s: stamps of another clock may be early.
@@ -182,9 +182,8 @@ def with_time_offset(calibration: Calibration, observation: Observation) -> Cali
     if len(found) < len(views):
         return calibration
     mean, interval, jitter = (np.array(values) for values in zip(*found, strict=True))
-    return replace(
-        calibration, time_offset_s=mean, time_offset_interval_s=interval, time_offset_jitter_s=jitter
-    )
+    offset = TimeOffset(time_offset_s=mean, time_offset_interval_s=interval, time_offset_jitter_s=jitter)
+    return replace(calibration, time_offset=offset)
 
 
 def _motions(q: FloatArray, moving: IntArray, t_q: FloatArray) -> dict[int, tuple[FloatArray, FloatArray]]:

@@ -449,7 +449,7 @@ class Chain:
 def _with_refits(config: Config, run: Run) -> Config:
     """The configuration with the refits of a run, which belong to its table, where it names none itself."""
     stored = run.results.get("calibrate")
-    if stored is None or config.calibration.refits or not run.calibration.refit:
+    if stored is None or config.calibration.refits or run.calibration.refits is None:
         return config
     before = load_config(run.path, text=stored.configuration)
     table = None if config.data is None else Path(config.data.table)

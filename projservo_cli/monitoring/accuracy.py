@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -22,7 +21,7 @@ from projservo_cli.monitoring.innovation_tests import (
     relative_noise,
     rigid_motions,
 )
-from projservo_cli.records import MM, BoolArray, Calibration, FloatArray, InputError, Model
+from projservo_cli.records import MM, BoolArray, Calibration, FloatArray, InputError, Model, changed
 
 # Variance of corners from a side that the calibration has not seen, over that of others; chance of a test.
 _UNUSUAL, _CHANCE = 2.0, 1e-4
@@ -144,7 +143,7 @@ def rigid_fit(calibration: Calibration, q: FloatArray, images: FloatArray, sigma
     for _ in range(_STEPS):
         step = np.linalg.lstsq(at.F[:, errors.tool], at.r, rcond=None)[0]
         moved = moved @ expm(np.tensordot(step, errors.twists, 1))
-        errors = ErrorModel(replace(calibration, M=calibration.M @ moved.T), calibration.sigma_px)
+        errors = ErrorModel(changed(calibration, M=calibration.M @ moved.T), calibration.sigma_px)
         at = errors.residual(pair)
     free, left = _free(at, at.F[:, errors.tool]), at.seen.ravel().copy()
     V, view_of = len(at.seen), np.arange(len(at.r)) // (2 * at.seen.shape[1])

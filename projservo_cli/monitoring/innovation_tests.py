@@ -128,14 +128,15 @@ class ErrorModel:
         m, n, V = len(calibration.M), len(calibration.H_hat_0), len(calibration.P)
         self.calibration, self.scene = calibration, parameters_from(calibration)
         self.errors, self.e = errors_of(calibration), calibration.sqrt_cov_shared.shape[1] + 3 * m
-        nonlinear = _BEYOND_FIRST_ORDER * calibration.sigma_px
+        fit = calibration.fit
+        nonlinear = _BEYOND_FIRST_ORDER * fit.sigma_px
         self._least = max(nonlinear, MIN_SIGMA)
         self._sigma, self._of_views = max(sigma_px, self._least), relative_noise(calibration)
-        self._stated = self._sigma / max(calibration.sigma_px, MIN_SIGMA) * (calibration.sigma_scale or 1.0)
-        self.bias_px = max(calibration.model_px, nonlinear)
-        sigma_q = calibration.sigma_q or 0.0
-        if calibration.sigma_q_interval is not None:
-            sigma_q = max(sigma_q, float(calibration.sigma_q_interval[1]))
+        self._stated = self._sigma / max(fit.sigma_px, MIN_SIGMA) * (fit.sigma_scale or 1.0)
+        self.bias_px = max(fit.model_px, nonlinear)
+        sigma_q = fit.sigma_q or 0.0
+        if fit.sigma_q_interval is not None:
+            sigma_q = max(sigma_q, float(fit.sigma_q_interval[1]))
         self.sigma_q = np.maximum(sigma_q * per_rad(calibration.prismatic), LEAST_ERROR)
         # Directions of points at infinity, of rigid motions, and of changes of a camera but for its scale.
         self.directions = np.linalg.svd(calibration.a_inf[None])[2][1:]

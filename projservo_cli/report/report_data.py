@@ -424,7 +424,7 @@ def _calibration(run: Run, names: Sequence[str | None]) -> dict[str, Any]:
     values["findings"] = [one.plain() | {"text": line(one, setup)} for one in calibration.findings]
     of_refits = zip(
         values.pop("refit"),
-        () if calibration.refit_numbers is None else calibration.refit_numbers.tolist(),
+        () if calibration.refits is None else calibration.refits.refit_numbers.tolist(),
         strict=True,
     )
     order, unshown = calibration.undecided_order, calibration.unshown

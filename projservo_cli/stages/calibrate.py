@@ -28,6 +28,7 @@ from projservo_cli.records import (
     IntArray,
     Observation,
     WorkFailed,
+    changed,
 )
 from projservo_cli.simulation.streams import NORMAL, SUGGESTIONS, generator
 from projservo_cli.stages import Progress, silent
@@ -166,7 +167,7 @@ def estimate(
         setup = Setup(seen.mount, board.observation.view, len(seen.joint_types))
         words, findings = "; ".join((str(error), *lines(found, setup))), (*error.findings, *found)
         raise type(error)(words, findings=findings) from error
-    calibration = replace(
+    calibration = changed(
         calibration,
         source=seen.source,
         placeholders=screening.placeholders,

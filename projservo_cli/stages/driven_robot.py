@@ -78,12 +78,10 @@ def _delays_of(given: EachView | None, calibration: Calibration) -> DelayPrior:
     """Return the prior of the delays of all views: given, calibrated, or wide."""
     view = calibration.view
     known = DelayPrior.unknown(len(view))
-    if calibration.time_offset_s is not None:
-        interval, jitter = calibration.time_offset_interval_s, calibration.time_offset_jitter_s
-        assert interval is not None
-        assert jitter is not None
-        sigma = np.maximum(np.ptp(interval, axis=1) / _INTERVAL, 0.5 * _LEAST_JITTER_S)
-        known = DelayPrior(calibration.time_offset_s.copy(), sigma, np.maximum(jitter, _LEAST_JITTER_S))
+    if (found := calibration.time_offset) is not None:
+        sigma = np.maximum(np.ptp(found.time_offset_interval_s, axis=1) / _INTERVAL, 0.5 * _LEAST_JITTER_S)
+        jitter = np.maximum(found.time_offset_jitter_s, _LEAST_JITTER_S)
+        known = DelayPrior(found.time_offset_s.copy(), sigma, jitter)
     if given is not None:
         if missing := [name for name in view if given.of(name) is None]:
             raise InputError(

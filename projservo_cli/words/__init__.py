@@ -6,11 +6,10 @@ A row of ``ROWS`` belongs to each code. Its texts are formats of ``values.VALUES
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from itertools import groupby
-from typing import Any
 
 from projservo_cli.deviations import DEVIATIONS
 from projservo_cli.findings import LIMITS, NOTE, REFUSES, Finding, columns, first, usable
-from projservo_cli.records import Calibration, WorkFailed
+from projservo_cli.records import Calibration, CalibrationVerdict, WorkFailed
 from projservo_cli.words.table import ROWS, Setup
 from projservo_cli.words.values import Told, quantity
 
@@ -114,18 +113,18 @@ def refused(findings: Sequence[Finding], setup: Setup) -> str:
     return words
 
 
-def judged(findings: Iterable[Finding], setup: Setup) -> dict[str, Any]:
-    """Return the fields of a calibration that follow from findings, the first on its residuals."""
+def judged(findings: Iterable[Finding], setup: Setup) -> CalibrationVerdict:
+    """Return the verdict on a calibration that follows from findings, the first on its residuals."""
     about, *rest = findings
     found = (about, *sorted(rest, key=lambda one: one.severity == NOTE))
-    return columns(found) | {
-        "usable": usable(found),
-        "reason": reason(found, setup),
-        "advice": advice(found, setup),
-        "limit": limit(_cause(found), setup),
-        "notes": advice((one for one in found if one.severity == NOTE), setup),
-        "findings": found,
-    }
+    return CalibrationVerdict(
+        usable=usable(found),
+        reason=reason(found, setup),
+        advice=advice(found, setup),
+        limit=limit(_cause(found), setup),
+        notes=advice((one for one in found if one.severity == NOTE), setup),
+        findings=found,
+    )
 
 
 def with_findings(
@@ -133,7 +132,10 @@ def with_findings(
 ) -> Calibration:
     """Return a calibration with further findings, those ``ahead`` before its own, judged by all."""
     about, *rest = calibration.findings
-    return replace(calibration, **judged((about, *ahead, *rest, *more), setup_of(calibration)))
+    verdict = judged((about, *ahead, *rest, *more), setup_of(calibration))
+    return replace(
+        calibration, verdict=verdict, stated=replace(calibration.stated, **columns(verdict.findings))
+    )
 
 
 def order_advice(calibration: Calibration) -> str:

@@ -1,12 +1,11 @@
 """What [RH00] section 2 says of a calibration: operators, plane at infinity, cameras, one common metric."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 
 from projservo_cli.calibration import calibrate, predict
 from projservo_cli.geometry.kinematics import forward_kinematics
+from projservo_cli.records import changed
 from tests.calibration.simulated_robot import around, random_robot, trials
 
 # Operators are assembled from twists and a frame change: a few hundred roundings, no more.
@@ -103,7 +102,7 @@ def test_a_point_behind_a_camera_has_no_image(case):
     turned = calibration.P.copy()
     turned[1] *= -1.0
     one = predict(calibration, q)
-    other = predict(dataclasses.replace(calibration, P=turned), q)
+    other = predict(changed(calibration, P=turned), q)
     np.testing.assert_array_equal(other[:, 0], one[:, 0])
     assert np.isnan(other[:, 1]).all()
     assert np.isfinite(one).all()

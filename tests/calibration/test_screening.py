@@ -7,7 +7,7 @@ import pytest
 
 from projservo_cli import Observations, calibrate
 from projservo_cli.calibration import residual_statistics
-from projservo_cli.records import Observation
+from projservo_cli.records import Calibration, Observation, flat_fields
 from projservo_cli.report.report_data import findings
 from tests.calibration.simulated_robot import around, random_robot, trials
 
@@ -25,8 +25,9 @@ def calibrated(observation):
 def numbers(calibration):
     """All arrays and numbers of a calibration that do not say what was screened."""
     of_screening = {"placeholders", "unseen_poses", "circular_joints"}
-    apart = {"advice", "notes", "findings", "observation", "seconds"} | of_screening
-    return {key: value for key, value in vars(calibration).items() if key not in apart}
+    apart = {"advice", "notes", "findings", "seconds"} | of_screening
+    names = {field.name for field in flat_fields(Calibration)}
+    return {name: getattr(calibration, name) for name in names - apart}
 
 
 @pytest.fixture(scope="module")

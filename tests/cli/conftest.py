@@ -11,7 +11,7 @@ from projservo_cli import cli
 from projservo_cli.calibration.checks import validation
 from projservo_cli.chain import outdated
 from projservo_cli.laws import law_and_mode
-from projservo_cli.records import Calibration, Observation, Plan, Report, Trace, WorkFailed
+from projservo_cli.records import Calibration, Observation, Plan, Refits, Report, Trace, WorkFailed
 from projservo_cli.stages import calibrate, plan, report, servo, validate
 from projservo_cli.stages.stage_inputs import CalibrationInputs, PlanInputs, RefitInputs, ServoInputs, Table
 from projservo_cli.store.observation_tables import read_table
@@ -65,8 +65,8 @@ class Stages:
             self._make(f"refit of {inputs.view}")
             assert before is not None
             observation, found, held_out = before
-            names = *found.refit, inputs.view
-            found = replace(found, refit=names, refit_numbers=np.ones((len(names), 3)))
+            names = *(found.refits.refit if found.refits else ()), inputs.view
+            found = replace(found, refits=Refits(refit=names, refit_numbers=np.ones((len(names), 3))))
             return observation, found, held_out
         told = inputs.source
         if isinstance(told, Table):

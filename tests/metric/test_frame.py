@@ -1,7 +1,5 @@
 """The metric of a calibration: closed forms, invariants, true arms, and arms that have no metric."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 from scipy.linalg import expm
@@ -10,7 +8,7 @@ from scipy.stats import chi2
 import projservo_cli as projservo
 from projservo_cli.config.whole import truth_of
 from projservo_cli.metric.frame import Metric
-from projservo_cli.records import Calibration, InputError, WorkFailed, composed, flat_fields
+from projservo_cli.records import Calibration, InputError, WorkFailed, changed, composed, flat_fields
 from projservo_cli.results import ImageModel
 from tests.calibration.simulated_robot import Robot, rig
 from tests.known import configured
@@ -150,7 +148,7 @@ def test_position_std_is_that_of_many_draws_of_the_errors(draws):
     n, places = len(c.H_hat_0), []
     for _ in range(200):
         d = np.split(0.1 * root @ rng.standard_normal(len(C)), np.cumsum([24, 16 * n]))
-        moved = dataclasses.replace(
+        moved = changed(
             c,
             P=c.P + d[0].reshape(2, 3, 4),
             H_hat_0=c.H_hat_0 + d[1].reshape(n, 4, 4),

@@ -14,7 +14,7 @@ from projservo_cli.cli import run
 from projservo_cli.metric.frame import MetricParameters
 from projservo_cli.metric.kinematic_errors import in_model_frames
 from projservo_cli.metric.opencv import opencv_cameras
-from projservo_cli.records import InputError
+from projservo_cli.records import InputError, changed
 from projservo_cli.results import ImageModel
 from projservo_cli.store import run_file
 from tests.calibration.simulated_robot import NAMES, around, random_robot
@@ -35,7 +35,7 @@ def test_exact_cameras_see_the_scene_from_a_flange_of_any_arm(types, views, fram
     """Whatever the projective frame: pixels, distances, and the true hand-eye transformation by a model."""
     arm = Hand(**vars(random_robot(types, rng, markers=6, views=views)))
     length = float(np.linalg.norm(arm.markers[0] - arm.markers[1]))
-    exact = dataclasses.replace(calibrated(arm, frame), mount="tool", view=NAMES[:views])
+    exact = changed(calibrated(arm, frame), mount="tool", view=NAMES[:views])
     m = exact.metric(length, (0, 10))
     q = around(arm, 5, rng)
     points = np.c_[m.markers, np.ones(len(m.markers))]

@@ -19,7 +19,7 @@ from projservo_cli.monitoring.at_rest import fault_at_rest
 from projservo_cli.monitoring.frame_pairs import FramePair
 from projservo_cli.monitoring.image_monitor import ImageMonitor
 from projservo_cli.monitoring.innovation_tests import WINDOW, Detector, ErrorModel
-from projservo_cli.records import Observation
+from projservo_cli.records import Observation, changed
 from tests.calibration.simulated_robot import random_robot, trials
 from tests.configured import calibrate, truth_of
 from tests.known import configured
@@ -39,7 +39,7 @@ class Arm(NamedTuple):
     image_size: np.ndarray
 
     def with_joint_noise(self, sigma_q, model_px=0.0):
-        noisy = dataclasses.replace(self.calibration, sigma_q=sigma_q, model_px=model_px)
+        noisy = changed(self.calibration, sigma_q=sigma_q, model_px=model_px)
         return self._replace(calibration=noisy)
 
     def way(self, seed):
@@ -308,7 +308,7 @@ def test_a_tag_that_is_off_by_less_than_a_pixel_in_one_posture_is_no_fault(
     arm, seed, tags, off, shift, changed
 ):
     """One view does not tell a slanted tag from one that moved by as little, which hides no moved camera."""
-    sharp = dataclasses.replace(arm.calibration, sigma_px=0.1, sigma_fitted_px=0.1)
+    sharp = changed(arm.calibration, sigma_px=0.1, sigma_fitted_px=0.1)
     q = arm.way(seed)[0][-1]
     s = noisy(arm.images(at_once(q[None])), seed, 0.1)[0]
     for tag in tags:

@@ -14,7 +14,7 @@ from projservo_cli.monitoring.at_rest import fault_at_rest
 from projservo_cli.monitoring.frame_pairs import FramePair, Pairing, TimedImage
 from projservo_cli.monitoring.hypotheses import Evidence, causes_of
 from projservo_cli.monitoring.image_monitor import ImageMonitor
-from projservo_cli.records import Observation
+from projservo_cli.records import Observation, changed
 from tests.calibration.simulated_robot import around, random_robot, revolute, trials
 from tests.calibration.test_cameras_on_the_tool import Hand
 from tests.monitoring.test_image_monitor import LOOKS, PERIOD, Arm, causes, first_alarm, look, noisy
@@ -196,7 +196,7 @@ def permuted(calibration, order):
     """The same calibration with its views in another order."""
     c, rows = calibration, np.arange(len(calibration.sqrt_cov_shared))
     rows[: c.P.size] = rows[: c.P.size].reshape(len(c.P), -1)[order].ravel()
-    return dataclasses.replace(
+    return changed(
         c,
         view=tuple(c.view[v] for v in order),
         P=c.P[order],
@@ -242,7 +242,7 @@ def test_the_order_of_the_views_does_not_matter(case):
 
 def test_residuals_of_the_model_itself_are_no_fault_more_often_than_stated(case, monkeypatch):
     """Errors of calibration, joints and instants of the first order; a chance of one run in five."""
-    runs, alarms, c = 8, 0, dataclasses.replace(case.calibration, sigma_q=1e-3)
+    runs, alarms, c = 8, 0, changed(case.calibration, sigma_q=1e-3)
     monkeypatch.setattr(innovation_tests, "_FALSE_ALARM", 0.2)
     q_dot = np.gradient(case.q, axis=0) / PERIOD
     params, away = prediction.parameters_from(c), prediction.from_reference(c, case.q)

@@ -8,7 +8,7 @@ import pytest
 from projservo_cli.calibration import calibrate, prediction_variance
 from projservo_cli.planning.model_spread import Region
 from projservo_cli.planning.pose_selection import suggest
-from projservo_cli.records import WorkFailed
+from projservo_cli.records import WorkFailed, changed
 from tests.calibration.simulated_robot import IMAGE_SIZE, around, random_robot, trials
 
 SIGMA = 0.5
@@ -88,8 +88,6 @@ def test_what_cannot_be_suggested_says_why(robot, few, region):
     with pytest.raises(WorkFailed, match="no further pose to suggest"):
         suggest(calibration, observation, nowhere, region, 1, np.random.default_rng(0))
     off = calibration.errors.scaled(1e4)
-    vague = dataclasses.replace(
-        calibration, sqrt_cov_shared=off.shared, sqrt_cov_marker=off.marker, sqrt_cov_own=off.own
-    )
+    vague = changed(calibration, sqrt_cov_shared=off.shared, sqrt_cov_marker=off.marker, sqrt_cov_own=off.own)
     with pytest.raises(WorkFailed, match="by this calibration"):
         suggest(vague, observation, region, region, 1, np.random.default_rng(0))

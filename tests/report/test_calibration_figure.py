@@ -7,7 +7,7 @@ from projservo_cli.calibration import predict
 from projservo_cli.calibration.prediction import parameters_from
 from projservo_cli.chain.outdated import steps_for
 from projservo_cli.config import load_config, to_yaml
-from projservo_cli.records import Observation
+from projservo_cli.records import Observation, changed
 from projservo_cli.report.report_data import Fit
 from projservo_cli.robots.frame_recorder import FrameRecorder
 from projservo_cli.store.run_file import Result, Run
@@ -20,7 +20,7 @@ SHIFT_PX = np.array([[0.3, -0.4], [-0.1, 0.2]])  # of each view
 
 def shifted(**fields):
     """A calibration and images that are what it predicts, but for one shift in each view."""
-    known = dataclasses.replace(case()[2].calibration, **fields)
+    known = changed(case()[2].calibration, **fields)
     q = case()[2].observation.q
     images = predict(known, q) + SHIFT_PX[:, None]
     return Fit(known, Observation(np.arange(len(q)) + 100, known.marker, q, images))

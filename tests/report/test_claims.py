@@ -68,9 +68,7 @@ def test_gap_of_two_paths_is_the_farthest_way_to_the_other(s, gap):
     straight = np.stack([np.linspace(0.0, 10.0, 101), np.full(101, 3.0)], axis=1)
     for first, second in ((straight, np.array(s)), (np.array(s), straight)):
         runs = {
-            law: dataclasses.replace(
-                material.traces[law], s=np.broadcast_to(path[:, None, None], (len(path), 2, 4, 2))
-            )
+            law: changed(material.traces[law], s=np.broadcast_to(path[:, None, None], (len(path), 2, 4, 2)))
             for law, path in (("direct_three", first), ("direct_two", second))
         }
         told, _ = measured("differ very little", dataclasses.replace(material, traces=runs))
@@ -125,7 +123,7 @@ def test_the_plateau_that_is_drawn_and_claimed_is_that_of_the_verdict():
     material = case()[2]
     judged = np.r_[100.0 * 0.9 ** np.arange(10), np.full(20, 30.0), 30.0 * 0.9 ** np.arange(1, 11)]
     trace, count = material.traces["stacked"], len(judged)
-    still = dataclasses.replace(
+    still = changed(
         trace,
         convergence_error=judged,
         image_error=100.0 * 0.9 ** np.arange(count),

@@ -10,7 +10,7 @@ from PIL import Image
 
 from projservo_cli.cli.output import words_of
 from projservo_cli.config import load_config, to_yaml
-from projservo_cli.records import CrossValidation
+from projservo_cli.records import CrossValidation, changed
 from projservo_cli.report.animation import write_animation
 from projservo_cli.report.claims import claims_of
 from projservo_cli.report.report_data import PAGE_FILE, stage_object
@@ -168,7 +168,7 @@ def test_runs_stand_side_by_side_and_a_figure_that_one_lacks_leaves_its_place_em
 def test_what_is_known_of_a_calibration_is_told(run, tmp_path):
     table = tmp_path / "table.csv"
     table.write_text("pose,marker\n")
-    calibration = dataclasses.replace(
+    calibration = changed(
         run.calibration,
         usable=False,
         prediction_noise=np.array([0.5, 7.25, 1.0, 1.0, 1.0, 1.0]),

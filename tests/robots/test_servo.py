@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 import projservo_cli as ps
 from projservo_cli.config import Override, load_config
+from projservo_cli.records import changed
 from projservo_cli.stages import report
 from projservo_cli.store.run_file import load, save
 from tests.configured import scenario_of
@@ -344,7 +345,7 @@ def test_images_that_stop_agreeing_on_the_path_to_the_start_stop_the_robot_there
 def test_a_calibration_that_is_not_usable_drives_no_robot(servo):
     run = load("run")
     made = run.results["calibrate"]
-    spoiled = dict(made.records, calibration=replace(run.calibration, usable=False))
+    spoiled = dict(made.records, calibration=changed(run.calibration, usable=False))
     save(replace(run, results={"calibrate": replace(made, records=spoiled)}))
     answer = servo(*SOUND, *NEAR)
     assert answer.code == 1

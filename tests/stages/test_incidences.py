@@ -138,7 +138,7 @@ def test_incidences_that_contradict_each_other_are_refused_by_their_names():
 def test_without_a_body_to_measure_with_incidences_are_refused():
     config, calibration, _ = made()
     with pytest.raises(WorkFailed, match="incidences are measured with the body"):
-        plan.run(config, replace(calibration, usable=False))
+        plan.run(config, changed(calibration, usable=False))
 
 
 class Own:

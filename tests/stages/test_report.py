@@ -65,7 +65,7 @@ def test_an_unknown_goal_leaves_out_what_needs_it_and_nothing_else(tmp_path, mon
     material = case()[2]
 
     def unknown(trace):
-        return dataclasses.replace(
+        return changed(
             trace,
             goal_pose=np.full((4, 4), np.nan),
             position_error_mm=None,

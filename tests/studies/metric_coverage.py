@@ -7,7 +7,6 @@ and of tool positions within the data's range.
 """
 
 import argparse
-import dataclasses
 
 import numpy as np
 from scipy.stats import chi2
@@ -16,7 +15,7 @@ import projservo_cli as projservo
 from projservo_cli.config.whole import truth_of
 from projservo_cli.metric.frame import Metric
 from projservo_cli.metric.kinematic_errors import in_model_frames
-from projservo_cli.records import WorkFailed
+from projservo_cli.records import WorkFailed, changed
 from tests.known import configured
 
 ARMS = ("paper", "ur5", "seven", "hobby")
@@ -33,7 +32,7 @@ def true_metric(truth, calibration, length):
     """The metric of the true robot, in the same frames; its length sets no scale."""
     order = [truth.number.index(number) for number in calibration.marker.tolist()]
     model = truth.model
-    exact = dataclasses.replace(
+    exact = changed(
         calibration,
         P=model.P,
         H_hat_0=model.H_hat_0,

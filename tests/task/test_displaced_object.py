@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from projservo_cli.records import InputError, WorkFailed
+from projservo_cli.records import InputError, WorkFailed, changed
 from projservo_cli.task.displaced_object import DisplacedObject
 from projservo_cli.task.look_bundle import Look
 from tests.calibration.simulated_robot import Robot, random_robot, rig
@@ -108,7 +108,7 @@ def test_errors_are_those_of_whole_estimates(arm, rng):
     G, step, std = frame(1), 1e-7, 1e-3
     c, other = (calibrated(one, G) for one in (arm, off_by(arm, step, rng)))
     change = [(b - a).reshape(-1, 1) for a, b in ((c.P, other.P), (c.H_hat_0, other.H_hat_0))]
-    c = dataclasses.replace(
+    c = changed(
         c,
         sqrt_cov_shared=std * np.concatenate(change) / step,
         sqrt_cov_marker=std * (other.M - c.M)[..., None] / step,
@@ -234,7 +234,7 @@ def test_what_is_no_displaced_object_is_named(arm, c):
     few[0].s[1, :4] = few[1].s[1, :4] = math.nan
     one = refused(c, NUMBERS, few)
     assert (one.code, one.subject.markers, one.subject.poses) == ("object_without_shape", (44, 45), (1,))
-    alone = dataclasses.replace(c, P=c.P[:1], view=("left",), sqrt_cov_shared=c.sqrt_cov_shared[12:])
+    alone = changed(c, P=c.P[:1], view=("left",), sqrt_cov_shared=c.sqrt_cov_shared[12:])
     one = refused(alone, NUMBERS, [Look(look.s[:1]) for look in (taught, now)])
     assert one.code == "object_without_size"
     found, goal = DisplacedObject.of(c, NUMBERS, [taught, now]), goal_of(arm)
@@ -245,6 +245,6 @@ def test_what_is_no_displaced_object_is_named(arm, c):
     assert refused(single, NUMBERS, [taught, now]).code == "object_open_infinity"
     assert refused(calibrated(SCARA, frame(1)), NUMBERS, looks(SCARA, MOVED, X=FLAT)).limit in (4, 0.3)
     with pytest.raises(InputError, match="cameras on the tool"):
-        DisplacedObject.of(dataclasses.replace(c, mount="tool"), NUMBERS, [taught, now])
+        DisplacedObject.of(changed(c, mount="tool"), NUMBERS, [taught, now])
     with pytest.raises(InputError, match="has no covariance"):
         DisplacedObject.of(c.without_covariance(), NUMBERS, [taught, now])

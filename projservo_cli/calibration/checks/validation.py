@@ -438,7 +438,7 @@ def _image_noise(calibration: Calibration, observation: Observation) -> float:
         straight = undistort(calibration.lens, detections.pixels)
         seen = detections.seen & np.isfinite(straight).all(axis=2)
         detections = replace(detections, pixels=np.where(seen[..., None], straight, 0.0), seen=seen)
-    sigma = calibration.sigma_px
+    sigma = calibration.fit.sigma_px
     if len(detections.pair) == 2 and np.count_nonzero(detections.both) >= _NOISE_PAIRS:
         with suppress(WorkFailed):
             sigma = Epipolar.of(detections, np.random.default_rng(0)).sigma_px

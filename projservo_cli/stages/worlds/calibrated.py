@@ -121,7 +121,7 @@ class CalibratedWorld:
     @property
     def noise_px(self) -> float:
         """Standard deviation of a coordinate of images in the loop, px."""
-        return max(self.inputs.noise_px, self.calibration.sigma_fitted_px)
+        return max(self.inputs.noise_px, self.calibration.fit.sigma_fitted_px)
 
     def ends(self, task: TaskSettings) -> tuple[TaskImages, FloatArray | None]:
         """Return start and goal without noise, and the joints (n,) at the goal, None for one by images alone.

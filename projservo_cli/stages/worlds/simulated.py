@@ -240,7 +240,7 @@ class RenderedWorld(SimulatedWorld):
     @property
     def noise_px(self) -> float:
         """Standard deviation of a coordinate of images in the loop, px."""
-        return max(self.inputs.noise_px, self.calibration.sigma_fitted_px)
+        return max(self.inputs.noise_px, self.calibration.fit.sigma_fitted_px)
 
     def shown(self, images: TaskImages, q_taught: FloatArray | None, seed: int) -> TaskImages:
         """Start and goal as rendered frames show them; images of the goal that are given stay as they are.
