@@ -106,14 +106,14 @@ def _kept(function: Callable[[Any], _Found]) -> Callable[[Any], _Found]:
     return cache(function)
 
 
-class Part:
+class RecordPart:
     """Base of a part of a record, whose fields stand among those of the record in files and JSON."""
 
 
-def part_of(entry: "Field[Any]") -> type[Part] | None:
+def part_of(entry: "Field[Any]") -> type[RecordPart] | None:
     """Kind of the part that a field holds; None of a field of another type."""
     kinds = (entry.type, *get_args(entry.type))
-    return next((kind for kind in kinds if isinstance(kind, type) and issubclass(kind, Part)), None)
+    return next((kind for kind in kinds if isinstance(kind, type) and issubclass(kind, RecordPart)), None)
 
 
 def is_optional(entry: "Field[Any]") -> bool:
@@ -416,7 +416,7 @@ class Observation:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Rig(Part):
+class CalibratedRig(RecordPart):
     """Cameras in the projective frame."""
 
     mount: str = _scalar(
@@ -429,7 +429,7 @@ class Rig(Part):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Arm(Part):
+class CalibratedArm(RecordPart):
     """Joints in the projective frame."""
 
     joint_types: str = _scalar(about="one letter a joint, R or P")
@@ -463,7 +463,7 @@ class Arm(Part):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Body(Part):
+class CalibratedBody(RecordPart):
     """Markers in the projective frame, scaled to ``a_inf @ M = 1``: their mean is their midpoint."""
 
     marker: IntArray = _array("marker", about="number of the marker")
@@ -476,7 +476,7 @@ class Body(Part):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class ParameterErrors(Part):
+class ParameterErrors(RecordPart):
     """Covariance of rig, arm and body, as ``Errors`` says; of a method without one it is not finite."""
 
     sqrt_cov_shared: FloatArray = _array(
@@ -504,7 +504,7 @@ class ParameterErrors(Part):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class JointEvidence(Part):
+class JointEvidence(RecordPart):
     """How well each joint is determined, and where its readings were."""
 
     excitation: FloatArray = _array("joint", "rad or m", "range of joint motion in the data")
@@ -519,7 +519,7 @@ class JointEvidence(Part):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class FitQuality(Part):
+class FitQuality(RecordPart):
     """Evidence of a calibration: its residuals and their noise."""
 
     rms_px: float = _scalar("px", "reprojection residual, rms per marker and view (Euclidean)")
@@ -554,7 +554,7 @@ class FitQuality(Part):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Rejections(Part):
+class Rejections(RecordPart):
     """Data that a calibration left out or read otherwise than they were written, or that decide nothing."""
 
     outlier: IntArray = _array(
@@ -602,7 +602,7 @@ class Rejections(Part):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class StatedErrors(Part):
+class StatedErrors(RecordPart):
     """Errors of predicted images, with the deviations from the model that limit them."""
 
     predicted_rms_px: float | None = _optional_scalar(
@@ -637,7 +637,7 @@ class StatedErrors(Part):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class TimeOffset(Part):
+class TimeOffset(RecordPart):
     """Time of joint readings less that of images, if poses in motion determine it."""
 
     time_offset_s: FloatArray = _array("view", "s", "time of a joint reading less the time of its image")
@@ -648,7 +648,7 @@ class TimeOffset(Part):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Refits(Part):
+class Refits(RecordPart):
     """Cameras that were fitted again."""
 
     refit: tuple[str, ...] = _scalar(
@@ -662,7 +662,7 @@ class Refits(Part):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class CalibrationVerdict(Part):
+class CalibrationVerdict(RecordPart):
     """Whether a calibration is usable, and what limits it."""
 
     usable: bool = _scalar(about="whether the calibration is usable for control")
@@ -697,9 +697,9 @@ class Calibration(Composite):
     method: str = _scalar(about="bundle_adjustment, maximum likelihood")
     source: str = _scalar(about="simulated or recorded")
     seconds: float = _scalar("s", "computing time")
-    rig: Rig
-    arm: Arm
-    body: Body
+    rig: CalibratedRig
+    arm: CalibratedArm
+    body: CalibratedBody
     parameter_errors: ParameterErrors
     verdict: CalibrationVerdict
     fit: FitQuality
@@ -812,7 +812,7 @@ def in_sense(theta_r: float, theta_p: float, q_hat: FloatArray) -> FloatArray:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class PlannedMotion(Part):
+class PlannedMotion(RecordPart):
     """Samples of a planned motion, and their margins."""
 
     path_parameter: FloatArray = _array("sample", about="path parameter from 0 to 1")
@@ -846,7 +846,7 @@ class PlannedMotion(Part):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class TaskPartition(Part):
+class TaskPartition(RecordPart):
     """A reaching task as a translation and two rotations, from images of start and goal, [RH00] section 4."""
 
     s_start: FloatArray = _array("view marker xy", "px", "images at the start")
@@ -874,7 +874,7 @@ class TaskPartition(Part):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class FaceVisibility(Part):
+class FaceVisibility(RecordPart):
     """Where each view sees the face by translation and rotation, and both senses of the latter."""
 
     optical_center: FloatArray = _array("view coordinate", about="optical centres")
@@ -890,7 +890,7 @@ class FaceVisibility(Part):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class JointSpaceSearch(Part):
+class JointSpaceSearch(RecordPart):
     """A search through joint space: its numbers, trees and required margins; none in other profiles."""
 
     n_goal_configurations: int = _scalar(
@@ -929,7 +929,7 @@ class JointSpaceSearch(Part):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class CarriedByObject(Part):
+class CarriedByObject(RecordPart):
     """Object that the goal was taught on, where it is now, and the goal carried along; none without one."""
 
     object_name: str = _scalar(about="name of the object that carries the goal")
@@ -993,7 +993,7 @@ class CarriedByObject(Part):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class GoalOfIncidences(Part):
+class GoalOfIncidences(RecordPart):
     """Goal that was chosen of those that incidences leave open; none for the whole pose."""
 
     incidences: tuple[str, ...] = _scalar(
@@ -1047,7 +1047,7 @@ class Plan(Composite):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class RunErrors(Part):
+class RunErrors(RecordPart):
     """How far a run ended from its goal."""
 
     position_error_mm: float | None = _scalar(
@@ -1079,7 +1079,7 @@ class RunErrors(Part):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class RunMetrics(Part):
+class RunMetrics(RecordPart):
     """Numbers by which runs of laws are compared."""
 
     success: bool | None = _optional_scalar(
@@ -1111,7 +1111,7 @@ class RunMetrics(Part):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class RunHistory(Part):
+class RunHistory(RecordPart):
     """Arrays of a run over time: joints, images, errors and commands."""
 
     q: FloatArray = _array("time joint", "rad or m", "joints")
@@ -1150,7 +1150,7 @@ class RunHistory(Part):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class TrueMotion(Part):
+class TrueMotion(RecordPart):
     """True poses of a run over time; NaN if unknown."""
 
     self_occluded: BoolArray = _array("time view", about="true self-occlusion of the face")
@@ -1160,7 +1160,7 @@ class TrueMotion(Part):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class IncidenceHistory(Part):
+class IncidenceHistory(RecordPart):
     """Incidences that were to hold at the goal of a run, and how far they were off."""
 
     incidences: tuple[str, ...] = _scalar(
@@ -1210,7 +1210,7 @@ class IncidenceHistory(Part):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class PlanFollowing(Part):
+class PlanFollowing(RecordPart):
     """How a run followed its plan."""
 
     mode: str = _scalar(
@@ -1224,7 +1224,7 @@ class PlanFollowing(Part):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class RecordedFrames(Part):
+class RecordedFrames(RecordPart):
     """Camera images that were kept of a run; absent if the robot provides none."""
 
     frame_index: IntArray = _array(

@@ -48,7 +48,7 @@ def fields(record: type, *, arrays: bool) -> Iterator[tuple[str, ...]]:
         about, dims = field.metadata, field.metadata.get("dims")
         if arrays == (dims is not None):
             hint = typing.get_args(field.type)[0] if "by_view" in about else field.type
-            hint = hint | None if field.name in lacking else hint
+            hint = hint | None if field.name in lacking and not records.has_default(field) else hint
             what = plain(hint) if dims is None else text(", ".join(dims))
             units = text(about["units"]) if arrays or "number" in what else ""
             name = f"{field.name}_<view>" if "by_view" in about else field.name

@@ -67,8 +67,9 @@ from projservo_cli.records import (
     TOOL,
     WHY_LOST,
     WORLD,
-    Arm,
-    Body,
+    CalibratedArm,
+    CalibratedBody,
+    CalibratedRig,
     Calibration,
     Errors,
     FitQuality,
@@ -80,7 +81,6 @@ from projservo_cli.records import (
     Observation,
     ParameterErrors,
     Rejections,
-    Rig,
     StatedErrors,
     changed,
     letters_of,
@@ -418,15 +418,15 @@ def _record(
         source="",
         view=detections.view,
         seconds=0.0,
-        rig=Rig(mount=detections.mount, P=params.P, lens=params.lens),
-        arm=Arm(
+        rig=CalibratedRig(mount=detections.mount, P=params.P, lens=params.lens),
+        arm=CalibratedArm(
             joint_types=letters_of(detections.prismatic),
             H_hat_0=params.H_hat,
             q_reference=problem.q_reference,
             a_inf=result.a_inf,
             **_curve_fields(params.curve, off),
         ),
-        body=Body(marker=detections.marker, M=params.M),
+        body=CalibratedBody(marker=detections.marker, M=params.M),
         parameter_errors=ParameterErrors(
             sqrt_cov_shared=off.shared, sqrt_cov_marker=off.marker, sqrt_cov_own=off.own
         ),

@@ -17,9 +17,10 @@ from projservo_cli.records import (
     TOOL,
     VIEWS,
     WORLD,
-    Arm,
-    Body,
     BoolArray,
+    CalibratedArm,
+    CalibratedBody,
+    CalibratedRig,
     Calibration,
     CalibrationVerdict,
     FitQuality,
@@ -28,7 +29,6 @@ from projservo_cli.records import (
     Model,
     ParameterErrors,
     Rejections,
-    Rig,
     StatedErrors,
     WorkFailed,
 )
@@ -83,14 +83,14 @@ class Truth:
             view=self.view,
             seconds=0.0,
             verdict=CalibrationVerdict(usable=True, reason="known", advice=()),
-            rig=Rig(mount=TOOL if self.on_tool else WORLD, P=self.model.P, lens=self.lens),
-            arm=Arm(
+            rig=CalibratedRig(mount=TOOL if self.on_tool else WORLD, P=self.model.P, lens=self.lens),
+            arm=CalibratedArm(
                 joint_types="".join("P" if slides else "R" for slides in self.model.prismatic),
                 H_hat_0=self.robot.H_hat_0,
                 q_reference=self.model.q_reference,
                 a_inf=self.model.a_inf,
             ),
-            body=Body(marker=np.array(self.number, dtype=np.int64), M=self.M),
+            body=CalibratedBody(marker=np.array(self.number, dtype=np.int64), M=self.M),
             parameter_errors=ParameterErrors(
                 sqrt_cov_shared=np.full((1, 1), np.nan), sqrt_cov_marker=unknown, sqrt_cov_own=unknown
             ),

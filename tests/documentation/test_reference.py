@@ -44,7 +44,7 @@ def test_every_column_field_command_and_equation_is_there():
     rows = told(regions.run_file())
     classes = filter(dataclasses.is_dataclass, vars(records).values())
     named = {kind for kind in classes if dataclasses.fields(kind)[0].metadata}
-    kinds = {kind for kind in named if not issubclass(kind, records.Part)}
+    kinds = {kind for kind in named if not issubclass(kind, records.RecordPart)}
     assert set(regions.GROUPS.values()) == kinds
     assert len(rows) == sum(len(records.flat_fields(kind)) for kind in kinds)
     assert all(len(row) == 4 and row[1] and row[3] for row in rows)
