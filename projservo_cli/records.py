@@ -760,7 +760,17 @@ class Calibration(Composite):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class CrossValidation:
+class HeldOutBlocks(RecordPart):
+    """Held-out errors of folds of like postures, and of consecutive poses; none if not asked for."""
+
+    posture_rms_px: float | None = _optional_scalar("px", "rms residual in folds of like postures")
+    posture_predicted_px: float | None = _optional_scalar("px", "expected rms of it")
+    time_rms_px: float | None = _optional_scalar("px", "rms residual in folds of consecutive poses")
+    time_predicted_px: float | None = _optional_scalar("px", "expected rms of it")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CrossValidation(Composite):
     """Repeatability of a calibration: images at poses that the fit which predicts them has not seen.
 
     The statistics are of Euclidean distances, one for each marker and view, as in ``validate``.
@@ -789,15 +799,12 @@ class CrossValidation:
     predicted: FloatArray = _array(
         "pose view marker xy", "px", "standard deviation of the residual from noise and covariance"
     )
-    posture_rms_px: float | None = _optional_scalar("px", "rms residual in folds of like postures")
-    posture_predicted_px: float | None = _optional_scalar("px", "expected rms of it")
-    time_rms_px: float | None = _optional_scalar("px", "rms residual in folds of consecutive poses")
-    time_predicted_px: float | None = _optional_scalar("px", "expected rms of it")
     others_px: FloatArray | None = _optional_array(
         "view with_or_without",
         "px",
         "rms residual of the other views, by fits with this view and without it; none of two views",
     )
+    blocks: HeldOutBlocks
 
 
 def in_unit(value: float, unit: str, digits: int = 6) -> str:

@@ -24,6 +24,7 @@ from projservo_cli.records import (
     Calibration,
     CrossValidation,
     FloatArray,
+    HeldOutBlocks,
     InputError,
     IntArray,
     Observation,
@@ -124,7 +125,7 @@ def cross_validate(
         marker=detections.marker,
         residual=residual,
         predicted=predicted,
-        **of_blocks,
+        blocks=HeldOutBlocks(**of_blocks),
     )
 
 
