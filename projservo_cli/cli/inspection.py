@@ -266,6 +266,7 @@ def _write_tables(run: Any, folder: Path) -> Iterator[Path]:
 
     from projservo_cli.files import write_whole
     from projservo_cli.findings import sparse
+    from projservo_cli.records import flat_fields
     from projservo_cli.store.observation_tables import to_csv
 
     rows, tables = [], {}
@@ -274,7 +275,7 @@ def _write_tables(run: Any, folder: Path) -> Iterator[Path]:
         # A name that a file can have anywhere.
         file = re.sub(r"\W", "_", "_".join(filter(None, place)), flags=re.ASCII) + ".csv"
         arrays = {}
-        for field in dataclasses.fields(record):
+        for field in flat_fields(type(record)):
             if (value := getattr(record, field.name)) is None:
                 continue
             dims, values = field.metadata.get("dims"), ""
