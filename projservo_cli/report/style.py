@@ -213,7 +213,9 @@ def legend_below(figure: "Figure", columns: int, more: Iterable[LineStyle] = ())
     for axes in figure.axes:
         if axes.get_legend() is None:
             for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
-                handles.setdefault(label, handle)
+                points = np.asarray(handle.get_xydata() if isinstance(handle, Line2D) else [])
+                if not points.size or np.isfinite(points).any():  # else nothing of it is drawn
+                    handles.setdefault(label, handle)
     for extra in more:
         handles[extra["label"]] = Patch(**extra) if "facecolor" in extra else Line2D([], [], **extra)
     for ncols in range(columns, 0, -1):
