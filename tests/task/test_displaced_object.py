@@ -246,5 +246,3 @@ def test_what_is_no_displaced_object_is_named(arm, c):
     assert refused(calibrated(SCARA, frame(1)), NUMBERS, looks(SCARA, MOVED, X=FLAT)).limit in (4, 0.3)
     with pytest.raises(InputError, match="cameras on the tool"):
         DisplacedObject.of(changed(c, mount="tool"), NUMBERS, [taught, now])
-    with pytest.raises(InputError, match="has no covariance"):
-        DisplacedObject.of(c.without_covariance(), NUMBERS, [taught, now])
