@@ -296,7 +296,7 @@ BENT_TAG = [
 
 
 @pytest.mark.parametrize(
-    ("seed", "tags", "off", "shift", "changed"),
+    ("seed", "tags", "off", "shift", "code"),
     [
         (6, (1,), 1.2, 0.0, None),
         (6, (1,), 1.2, 3.0, "displaced_camera"),
@@ -304,9 +304,7 @@ BENT_TAG = [
         (0, (1,), 3.0, 0.0, "unexplained_images"),
     ],
 )
-def test_a_tag_that_is_off_by_less_than_a_pixel_in_one_posture_is_no_fault(
-    arm, seed, tags, off, shift, changed
-):
+def test_a_tag_that_is_off_by_less_than_a_pixel_in_one_posture_is_no_fault(arm, seed, tags, off, shift, code):
     """One view does not tell a slanted tag from one that moved by as little, which hides no moved camera."""
     sharp = changed(arm.calibration, sigma_px=0.1, sigma_fitted_px=0.1)
     q = arm.way(seed)[0][-1]
@@ -316,7 +314,7 @@ def test_a_tag_that_is_off_by_less_than_a_pixel_in_one_posture_is_no_fault(
     s[0] += shift
     fault = fault_at_rest(sharp, Observation.of_one(sharp.marker, q, s, sharp.view), arm.image_size)
     named = None if fault is None else fault.others[0] if fault.others else fault
-    assert (named and named.code) == changed
+    assert (named and named.code) == code
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ in a file of this folder with those of its topic. Some are drawn of a single res
 """
 
 from importlib import import_module
+from pathlib import Path
 from pkgutil import iter_modules
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
@@ -19,8 +20,8 @@ from projservo_cli.task.face import cyclic_order
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-for _topic in iter_modules(__path__, f"{__name__}."):  # figures register themselves where they are imported
-    import_module(_topic.name)
+for _topic in iter_modules([str(Path(__file__).parent)]):  # figures register themselves
+    import_module(f"projservo_cli.report.figures.{_topic.name}")
 FIGURES = tuple(REGISTER[name] for name in sorted(REGISTER))
 
 
