@@ -477,7 +477,7 @@ class CalibratedBody(RecordPart):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ParameterErrors(RecordPart):
-    """Covariance of rig, arm and body, as ``Errors`` says; of a method without one it is not finite."""
+    """Covariance of rig, arm and body, as ``Errors`` says; not finite of a truth, which has none."""
 
     sqrt_cov_shared: FloatArray = _array(
         "parameter error",

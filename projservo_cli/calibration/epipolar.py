@@ -48,8 +48,6 @@ _CORE_OPEN = 10.0
 _MIN_PARALLAX = 3.0
 # Noise over the extent of the markers, below which images are exact: of 0.01 px no detector is better.
 _EXACT = 1e-4
-# Rounds of the search for an isotropic frame.
-_WHITENINGS = 30
 # Maximum number of markers a pose of which all pairs are compared.
 _PAIRED = 20
 # Maximum number of poses whose distances are compared.
@@ -315,31 +313,6 @@ def planar_homography(a: FloatArray, b: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.svd(rows, full_matrices=len(rows) < rows.shape[1])[2][8].reshape(3, 3))
 
 
-def reconstruct(F: FloatArray, left: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Cameras (2, 3, 4) and points (N, 4) of corresponding pixels (N, 2) in an isotropic projective frame.
-
-    Points are of unit norm, with positive depth in both views where the data allow it.
-    """
-    T = np.stack([similarity(left), similarity(right)])
-    back = np.linalg.inv(T)
-    P = _canonical_pair(back[1].T @ F @ back[0])
-    # The right camera is known up to P' + e' vᵀ: a frame in which its left block is not singular.
-    points = triangulated(P[:, None], np.stack([homogeneous(left) @ T[0].T, homogeneous(right) @ T[1].T]))
-    W = _isotropic_frame(points)
-    points = points @ W.T
-    P = back @ P @ np.linalg.inv(W)
-    depth = points @ P[:, 2].T
-    points = points * np.sign(depth[:, :1]) / np.linalg.norm(points, axis=1, keepdims=True)
-    P[1] *= np.sign(np.median(points @ P[1, 2]))
-    return P, points
-
-
-def _canonical_pair(F: FloatArray) -> FloatArray:
-    """Cameras (2, 3, 4) of a fundamental matrix, [I | 0] and [[e']× F | e']: [HZ04] result 9.14."""
-    e = np.linalg.svd(F)[0][:, 2]
-    return np.stack([np.eye(3, 4), np.hstack([np.cross(e[:, None], F, axis=0), e[:, None]])])
-
-
 def triangulated(P: FloatArray, m: FloatArray) -> FloatArray:
     """Points (N, 4) of unit norm from homogeneous pixels (V, N, 3) of cameras (V, N, 3, 4): [HZ04] 12.2.
 
@@ -347,19 +320,6 @@ def triangulated(P: FloatArray, m: FloatArray) -> FloatArray:
     """
     rows = m[..., :2, None] * P[:, :, 2:] - P[:, :, :2]
     return np.linalg.svd(rows.swapaxes(0, 1).reshape(-1, 4, 4))[2][:, 3]
-
-
-def _isotropic_frame(points: FloatArray) -> FloatArray:
-    """Frame change W (4, 4) that makes the second moment of points (N, 4) of unit norm a multiple of I.
-
-    Without it one coordinate is a thousand times another, and every later linear method fails.
-    """
-    W = np.eye(4)
-    for _ in range(_WHITENINGS):
-        moved = points @ W.T
-        moved = moved / np.linalg.norm(moved, axis=1, keepdims=True)
-        W = np.linalg.inv(np.linalg.cholesky(4.0 * moved.T @ moved / len(moved))) @ W
-    return W
 
 
 @dataclass(frozen=True, eq=False)

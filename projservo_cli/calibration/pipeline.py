@@ -87,7 +87,6 @@ from projservo_cli.records import (
 )
 from projservo_cli.words import judged, with_findings
 
-METHOD = "bundle_adjustment"
 # Fitted over expected noise above which a fit that passes may still have one joint at fault.
 _DOUBTFUL_RATIO = 2.0
 # Motion of images by the noise of joints over pixel noise, from which it may hide what is not as given.
@@ -414,7 +413,7 @@ def _record(
     off = result.errors(solution, errors).scaled(factor * expected.noise_px(solution))
     about_all = judged(findings, detections.setup)
     return Calibration(
-        method=METHOD,
+        method="bundle_adjustment",
         source="",
         view=detections.view,
         seconds=0.0,

@@ -1,4 +1,4 @@
-"""Trial motions, the table that stands in for them, and the method that evaluates them."""
+"""Trial motions, the table that stands in for them, and how they are evaluated."""
 
 from typing import Annotated, Literal
 

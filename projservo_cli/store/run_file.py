@@ -432,10 +432,10 @@ def load_record(group: h5py.Group, kind: Any, sizes: dict[str, int]) -> Any:
         if "by_view" in field.metadata:
             each, names = typing.get_args(inner)[0], (f"{name}_{view}" for view in views)
             values[name] = tuple(_value(one, attribute(group, one), each) for one in names)
-        elif not stored and name in lacking and not (optional or has_default(field)):
-            continue  # with its part, or the part cannot be made
         elif not stored and (optional or has_default(field)):
             values[name] = field.default if has_default(field) else None
+        elif not stored and name in lacking:
+            continue  # with its part, or the part cannot be made
         elif dims is None:
             values[name] = _value(name, attribute(group, name), inner)
         else:
@@ -447,6 +447,8 @@ def load_record(group: h5py.Group, kind: Any, sizes: dict[str, int]) -> Any:
         sizes["joint"] = own["joint"]
     if "joint_types" in values and not re.fullmatch(f"[RP]{{{own['joint']}}}", values["joint_types"]):
         raise ValueError(f"joint_types are not {own['joint']} letters R and P")
+    if values.get("method") == "closed_form":  # it has no covariance, which all others have
+        raise ValueError("its calibration is by the method closed_form, which is retired")
     record = composed(kind, values)
     if "findings" in values and "findings" not in group.attrs:
         return changed(record, findings=_told(record))

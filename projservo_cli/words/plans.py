@@ -83,7 +83,7 @@ OF_PLAN = {
         "name others in markers.face",
     ),
     "no_image_test": Row("stop.innovation_threshold is 0"),
-    "no_covariance": Row("the calibration has no covariance, which the method bundle_adjustment gives"),
+    "no_covariance": Row("the calibration has no covariance"),
     "object_far": Row(
         "objects.{name} has moved by {amount}, more than {limit}",
         "look whether the goal is free there, then confirm it (--confirm), or raise objects.{key}",

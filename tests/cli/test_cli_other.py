@@ -45,7 +45,7 @@ def test_validate_prints_the_statistics_of_a_table(projservo, reported, statisti
     assert "left camera" not in answer.err
     left |= {"median_px": 1.6}  # both: no camera alone
     assert "--refit" not in projservo("validate", "out", "--data", "t.csv").err
-    statistics["limit_px"] = None  # as of a method without covariance, which states no error
+    statistics["limit_px"] = None  # as of poses without a pair
     assert projservo("validate", "out", "--data", "t.csv", "--json").code == 0
     (tmp_path / "one.csv").write_text("pose,marker,q1,u_left,v_left,u_right,v_right\n0,0,1,2,3,4,5\n")
     answer = projservo("validate", "out", "--data", "one.csv")

@@ -6,7 +6,16 @@ import pickle
 import numpy as np
 import pytest
 
-from projservo_cli.records import Calibration, GoalOfIncidences, Plan, Trace, changed, flat_fields
+from projservo_cli.records import (
+    Calibration,
+    GoalOfIncidences,
+    InputError,
+    Observation,
+    Plan,
+    Trace,
+    changed,
+    flat_fields,
+)
 from projservo_cli.results import MotionPlan
 from projservo_cli.store.run_file import Result, Run, load, save
 from tests.fake_records import fake
@@ -50,6 +59,16 @@ def test_fields_are_changed_wherever_they_are():
     assert (type(other), other.asked, plan.tau) == (MotionPlan, ("here", "there"), fake(Plan).tau)
     with pytest.raises(TypeError, match="nothing"):
         changed(plan, nothing=1)
+
+
+def test_a_calibration_by_the_retired_method_is_refused_with_a_remedy(tmp_path):
+    records = {
+        "observation": fake(Observation),
+        "calibration": changed(fake(Calibration), method="closed_form"),
+    }
+    save(Run(tmp_path / "run.h5", "", {"calibrate": Result("", "", {}, {}, records)}))
+    with pytest.raises(InputError, match=r"by the method closed_form, which is retired.*make it again"):
+        load(tmp_path)
 
 
 def test_a_part_comes_back_from_a_file_where_it_was(tmp_path):

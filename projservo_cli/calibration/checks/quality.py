@@ -202,7 +202,7 @@ class _Assessment:
     """Excitation and noise of each joint, and the findings on a calibration."""
 
     span: FloatArray  # (n,) range in the data, rad or m
-    noise: FloatArray  # (n,) noise of images at the reach, in units of the pixel noise; NaN if unknown
+    noise: FloatArray  # (n,) noise of images at the reach, in units of the pixel noise
     # expected error of images at random poses and its 99th percentile, px
     error: tuple[float, float]
     check: ModelCheck | None  # deviations from the model; None if it is exact, as in a simulation

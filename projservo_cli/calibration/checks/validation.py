@@ -297,7 +297,7 @@ def residual_statistics(calibration: Calibration, observation: Observation) -> d
     observation : stereo images of the same robot, px; poses in motion do not count.
     Returns ``count``; ``rms_px``, ``median_px``, ``p95_px`` (None without a pair); ``stated_px``, the median
     error that the covariance states at these readings, ``noise_px`` of these images and readings, and
-    ``limit_px`` of the median by both (None without a covariance); ``views``, the ``view``, ``count``,
+    ``limit_px`` of the median by both (None without a pair); ``views``, the ``view``, ``count``,
     ``median_px`` and ``limit_px`` of each; ``skipped``, the numbers of pairs of unknown markers, behind the
     camera, and missing; ``advice`` about placeholders, which are missing ones;
     ``findings``, on these and on medians beyond their limits.
@@ -318,7 +318,7 @@ def residual_statistics(calibration: Calibration, observation: Observation) -> d
     views = [_distance_statistics(distance[:, v][compared[:, v]]) for v in range(len(calibration.view))]
     stated = noise = limit = None
     limits: list[float | None] = [None] * len(views)
-    if found["count"] and np.isfinite(calibration.sqrt_cov_shared).all():
+    if found["count"]:
         of_pairs = prediction_variance(calibration, observation.q).sum(axis=-1)[:, :, order]
         of_readings = np.zeros_like(of_pairs)
         if sigma_q := calibration.sigma_q:  # these readings have their own noise
