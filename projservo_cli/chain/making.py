@@ -4,7 +4,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import KW_ONLY, InitVar, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,11 +13,7 @@ from projservo_cli.chain.outdated import STAGES, Step, inputs_of, key_of_calibra
 from projservo_cli.chain.recordings import recording_made
 from projservo_cli.chain.sequences import Steps
 from projservo_cli.config import Config, load_config, stored_yaml
-from projservo_cli.config.inputs import (
-    about_of,
-    scenery_of,
-    suggestion_inputs,
-)
+from projservo_cli.config.inputs import about_of, scenery_of, suggestion_inputs
 from projservo_cli.findings import Finding
 from projservo_cli.laws import CODES, POINT_LAWS, codes_of, law_and_mode, must_converge, run_name
 from projservo_cli.loop.compilation import compilation
@@ -28,9 +24,6 @@ from projservo_cli.stages.stage_inputs import CarryingObject, PlanInputs
 from projservo_cli.store.run_file import SERVO, Run, save
 from projservo_cli.words import failed, line
 from projservo_cli.words.reasons import arrived, meaning
-
-if TYPE_CHECKING:
-    pass
 
 FIGURES = "figures"  # folder of a run in which a killed report may have left something
 

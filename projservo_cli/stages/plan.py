@@ -392,10 +392,10 @@ def _motion_of(found: Found) -> PlannedMotion:
 
 
 def _partition_of(
-    state: State, task: Task, parts: Parts, images: TaskImages, amplitudes: FloatArray
+    state: State, task: Task, parts: Parts, images: TaskImages, reaching: Reaching
 ) -> TaskPartition:
-    """Translation and rotations of a task, by the amplitudes (3,) of its motion."""
-    face, (tau, theta_r, theta_p) = images.by_points(), (float(x) for x in amplitudes)
+    """Translation and rotations of a task, by the operators and amplitudes of its motion."""
+    face, (tau, theta_r, theta_p) = images.by_points(), (float(x) for x in reaching.amplitudes)
     center = center_of(task.A_star, images.center)
     return TaskPartition(
         s_start=face.s_start,
@@ -404,24 +404,19 @@ def _partition_of(
         A_star=task.A_star,
         A_t=state.A_t,
         A_r=state.A_r,
-        a=np.array(parts.a),
+        a=reaching.a,
         a_star=np.array(face_plane(task.A_star, task.order, center)),
         a_t=np.array(parts.a_t),
         A_c=np.array(parts.A_c),
         A_c_star=np.array(center),
         q_start=images.q_start,
         q_hat=_joint_motions(state),
-        H_hat=_operators_of(parts),
+        H_hat=reaching.H_hat,
         tau=tau,
         theta_r=theta_r,
         theta_p=theta_p,
         theta_s=composed_angle(theta_r, theta_p)[0],
     )
-
-
-def _operators_of(parts: Parts) -> FloatArray:
-    """Operators t, r, p (3, 4, 4) of a partitioned task."""
-    return np.array([as_array(H) for H in (parts.H_t, parts.H_r, parts.H_p)])
 
 
 def _planned(
@@ -433,7 +428,7 @@ def _planned(
 ) -> tuple[Plan, Finding | None]:
     """Return the plan of one profile, and the first constraint that fails; None if all hold."""
     state, task, parts, arrives = _partitioned(model, images, trajectory, demands.limits)
-    H_hat = _operators_of(parts)
+    H_hat = np.array([as_array(H) for H in (parts.H_t, parts.H_r, parts.H_p)])
     a, amplitudes = np.array(parts.a), np.array([parts.tau, parts.theta_r, parts.theta_p])
     tau_0, theta_0 = _changes(a, H_hat, task)
     tau_limit = min((trajectory.visibility_fraction * t for t in tau_0 if t > 0.0), default=math.inf)
@@ -474,7 +469,7 @@ def _planned(
         view=images.view,
         constraint=constraint,
         motion=_motion_of(found),
-        partition=_partition_of(state, task, parts, images, motion.reaching.amplitudes),
+        partition=_partition_of(state, task, parts, images, motion.reaching),
         visibility=FaceVisibility(
             optical_center=task.O,
             tau_0=tau_0,

@@ -75,7 +75,7 @@ def given_pixels(
     s = np.array([pixels.get(number, none) for number in numbers]).swapaxes(0, 1)
     told = [number for number in numbers if number in pixels]
     sigma = np.full(s.shape[:2], np.nan)
-    known = [number in told for number in numbers]
+    known = [number in pixels for number in numbers]
     sigma[:, known] = np.array(images.deviations(told, face, view)).reshape(len(s), -1)
     return s, sigma
 
