@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import MISSING, Field, dataclass, field, fields, replace
 from functools import cache
-from typing import Any, NamedTuple, TypeVar, get_args
+from typing import Any, NamedTuple, TypeVar, get_args, get_origin
 
 import numpy as np
 import numpy.typing as npt
@@ -121,6 +121,11 @@ def is_optional(entry: "Field[Any]") -> bool:
     return type(None) in get_args(entry.type)
 
 
+def is_list(entry: "Field[Any]") -> bool:
+    """Tell whether a field holds any number of parts, of which the first stands among those of the record."""
+    return part_of(entry) is not None and get_origin(entry.type) is tuple
+
+
 def has_default(entry: "Field[Any]") -> bool:
     """Tell whether a field has a default."""
     return entry.default is not MISSING
@@ -139,7 +144,7 @@ def flat_fields(kind: Any) -> tuple["Field[Any]", ...]:
 @_kept
 def optional_names(kind: Any) -> frozenset[str]:
     """Names of the fields of those parts of a kind of record that may be absent."""
-    parts = [part_of(entry) for entry in fields(kind) if is_optional(entry)]
+    parts = [part_of(entry) for entry in fields(kind) if is_optional(entry) or is_list(entry)]
     return frozenset(entry.name for part in parts if part for entry in flat_fields(part))
 
 
@@ -158,11 +163,14 @@ class Composite:
     """Base of a record of parts: what these have are attributes of the record, too."""
 
     def __getattr__(self, name: str) -> Any:
-        """What a part has by a name; of an absent part the default of the field, or None."""
+        """Attribute of a part, of a list of the first; its default where it is absent."""
         place = _places(type(self)).get(name)
         if place is None:
             raise AttributeError(f"{type(self).__name__} has no {name}")
-        if (part := getattr(self, place)) is not None:
+        part = getattr(self, place)
+        if isinstance(part, tuple):
+            part = part[0] if part else None
+        if part is not None:
             return getattr(part, name)
         defaults = (entry.default for entry in flat_fields(type(self)) if entry.name == name)
         default = next(defaults, None)
@@ -176,7 +184,10 @@ _Record = TypeVar("_Record")
 
 
 def composed(kind: Any, values: Mapping[str, Any]) -> Any:
-    """Make a record of values of its flat fields; an optional part is absent without a required one."""
+    """Make a record of values of its flat fields; an optional part is absent without a required one.
+
+    values : of a list of parts those after the first, by its own name.
+    """
     own: dict[str, Any] = {}
     for entry in fields(kind):
         part = part_of(entry)
@@ -184,19 +195,29 @@ def composed(kind: Any, values: Mapping[str, Any]) -> Any:
             own[entry.name] = values[entry.name]
         elif part is not None:
             needed = (one.name for one in flat_fields(part) if not (is_optional(one) or has_default(one)))
-            there = not is_optional(entry) or any(values.get(name) is not None for name in needed)
+            many, known = is_list(entry), any(values.get(name) is not None for name in needed)
+            there = known or not (many or is_optional(entry))
             own[entry.name] = composed(part, values) if there else None
+            if many:
+                own[entry.name] = (own[entry.name], *values.get(entry.name, ())) if there else ()
     return kind(**own)
 
 
 def changed(record: _Record, **values: Any) -> _Record:
-    """Return a record with other values of some fields, its own or those of the parts that it has."""
+    """Return a record with other values of some fields, its own or those of the parts that it has.
+
+    Of a list of parts the first is meant.
+    """
     own: dict[str, Any] = {}
     of_parts: dict[str, dict[str, Any]] = {}
     for name, value in values.items():
         place = _places(type(record)).get(name)
         (own if place is None else of_parts.setdefault(place, {}))[name] = value
-    own |= {place: replace(getattr(record, place), **inner) for place, inner in of_parts.items()}
+    for place, inner in of_parts.items():
+        held = getattr(record, place)
+        first, *others = held if isinstance(held, tuple) else (held,)
+        part = replace(first, **inner)
+        own[place] = (part, *others) if isinstance(held, tuple) else part
     return replace(record, **own)  # type: ignore[type-var]  # records are dataclasses
 
 
@@ -937,7 +958,10 @@ class JointSpaceSearch(RecordPart):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CarriedByObject(RecordPart):
-    """Object that the goal was taught on, where it is now, and the goal carried along; none without one."""
+    """Object that the goal was taught on, where it is now, and the goal carried along.
+
+    A goal may have several: files have the first among the fields of the plan, others in groups of their own.
+    """
 
     object_name: str = _scalar(about="name of the object that carries the goal")
     object_shift_mm: float | None = _optional_scalar(
@@ -969,6 +993,10 @@ class CarriedByObject(RecordPart):
     )
     s_carried: FloatArray = _array(
         "view observed xy", "px", "images of all markers of the body at the carried goal"
+    )
+    M_object: FloatArray | None = _optional_array(
+        "object_marker coordinate",
+        about="its markers in the frame of the body, where this was when the goal was taught; NaN if unseen",
     )
 
     @property
@@ -1050,7 +1078,7 @@ class Plan(Composite):
     visibility: FaceVisibility
     open_goal: GoalOfIncidences | None = None
     search: JointSpaceSearch | None = None
-    carried: CarriedByObject | None = None
+    carried: tuple[CarriedByObject, ...] = ()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -20,7 +20,7 @@ from projservo_cli.loop.compilation import compilation
 from projservo_cli.progress import Listener
 from projservo_cli.records import InputError, Plan, WorkFailed
 from projservo_cli.result_hashes import digest
-from projservo_cli.stages.stage_inputs import CarryingObject, PlanInputs
+from projservo_cli.stages.stage_inputs import PlanInputs
 from projservo_cli.store.run_file import SERVO, Run, save
 from projservo_cli.words import failed, line
 from projservo_cli.words.reasons import arrived, meaning
@@ -194,34 +194,33 @@ class Chain:
         Simulated or not: where one has moved too far and nobody is asked, nothing moves.
         """
         for step in steps:
-            if step.stage != "plan" or (carrier := self._carrier(step)) is None:
-                continue
-            from projservo_cli.stages.carried_goals import too_far
-
-            carried = self.run.results[step.name].records[""].carried
-            self.listener.say(carried.object_words)
-            if carried.object_shift_mm is None:
-                self.listener.say(
-                    "objects.max_displacement_m is not compared, since no length on the tool is known: set "
-                    "markers.positions_m, markers.tag_size_m or markers.board.size_m"
-                )
-            if (far := too_far(carried, carrier)) is None:
-                continue
-            if not self.confirm:
-                self._fail(motion, failed([far]))
-                return False
-            self.listener.say(line(far))
+            for far in self._far(step) if step.stage == "plan" else ():
+                if not self.confirm:
+                    self._fail(motion, failed([far]))
+                    return False
+                self.listener.say(line(far))
         if self.confirm:
             if self.config.steps:
                 self.listener.say(f"servo: one after the other: {', '.join(self.config.steps)}")
             self.listener.confirm("servo", self.config.plant)
         return True
 
-    def _carrier(self, step: Step) -> CarryingObject | None:
-        """Return the object of the goal of a plan; None for a goal that stands still."""
-        record = step.record or inputs_of("plan", self.config.at_step(step.part))
-        carrier: CarryingObject | None = record.carrier
-        return carrier
+    def _far(self, step: Step) -> Iterator[Finding]:
+        """Tell where the objects of a plan are, and yield those that have moved too far."""
+        from projservo_cli.stages.carried_goals import too_far
+
+        inputs = step.record or inputs_of("plan", self.config.at_step(step.part))
+        for carried, carrier in zip(
+            self.run.results[step.name].records[""].carried, inputs.carriers, strict=True
+        ):
+            self.listener.say(carried.object_words)
+            if carried.object_shift_mm is None:
+                self.listener.say(
+                    "objects.max_displacement_m is not compared, since no length on the tool is known: set "
+                    "markers.positions_m, markers.tag_size_m or markers.board.size_m"
+                )
+            if (far := too_far(carried, carrier)) is not None:
+                yield far
 
     def _fail(self, step: Step, why: str | WorkFailed) -> None:
         """Note the failure of a step, of a sequence with what stays as it was sent."""
@@ -455,7 +454,7 @@ def _with_refits(config: Config, run: Run) -> Config:
 
 def _drives(step: Step) -> bool:
     """Whether a step reads a robot: a recording, and a plan to a goal on an object that lies anywhere."""
-    return step.stage == "record" or (step.record is not None and step.record.carrier is not None)
+    return step.stage == "record" or bool(step.record is not None and step.record.carriers)
 
 
 def require_simulated(config: Config) -> None:

@@ -104,7 +104,7 @@ def steps_for(
             why = _reason(step, run, force and step.stage in named, remade)
             if step.stage == "servo" and own:
                 why = why or "a real robot moves in every call"
-            looks = step.stage == "plan" and step.record is not None and step.record.carrier is not None
+            looks = step.stage == "plan" and step.record is not None and step.record.carriers
             if looks and {"plan", "servo"} & {*named} and not config.plant.simulated:
                 why = why or "its object may lie elsewhere now"
             if step.stage == "plan" and own and config.task and config.task.start_joints is None:

@@ -6,14 +6,14 @@ other values, and descriptions of robot and rig are resolved here and nowhere be
 
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from projservo_cli.config.loading import Config, stored_yaml
-from projservo_cli.config.whole import name_of_carrier, truth_of
+from projservo_cli.config.whole import carriers_of, truth_of
 from projservo_cli.control.law import Gains
 from projservo_cli.detection import Board
 from projservo_cli.display import About
@@ -22,7 +22,8 @@ from projservo_cli.result_hashes import File
 from projservo_cli.robots.settings import Following, JointSettings, SpeedLimits
 from projservo_cli.settings.disturbance import Disturbance, Events, Faults
 from projservo_cli.settings.features import Feature, Pair
-from projservo_cli.settings.objects import WORLD_AND_TOOL, ObjectSettings
+from projservo_cli.settings.objects import ObjectSettings
+from projservo_cli.settings.task import Goal as GoalSettings
 from projservo_cli.simulation.described import (
     arm_of,
     cameras_of,
@@ -206,7 +207,8 @@ def plan_inputs(config: Config, files: Files | None = None, *, predicted: bool =
     assert markers is not None
     simulated = config.plant.simulated and not predicted
     known = markers.known if markers.tags is not None else ()
-    pairs = () if config.task is None else config.task.goal.incidences
+    pairs, carriers = () if config.task is None else config.task.goal.incidences, _carriers(config, files)
+    names = [one.name for one in carriers]
     displaced = _displacement(config)
     return PlanInputs(
         task=config.task,
@@ -228,27 +230,31 @@ def plan_inputs(config: Config, files: Files | None = None, *, predicted: bool =
         tests_images=config.stop.innovation_threshold > 0.0,
         trajectory=config.trajectory,
         lengths=markers.lengths(face),
-        incidences=tuple(_incidence(pair, config.features, displaced) for pair in pairs),
-        carrier=_carrier(config, files),
+        incidences=tuple(_incidence(pair, config.features, displaced, names) for pair in pairs),
+        carriers=carriers,
         displaced=displaced,
     )
 
 
-def _incidence(pair: Pair, features: Mapping[str, Feature], displaced: StandOff | None) -> Incidence:
+def _incidence(
+    pair: Pair, features: Mapping[str, Feature], displaced: StandOff | None, carriers: Sequence[str]
+) -> Incidence:
     """Return a pair of features, as messages and figures write it, with the numbers of its markers.
 
     displaced : of the goal, so that nobody takes an approach for the arrival.
+    carriers : names of the objects of the goal.
     """
     back = "" if displaced is None else f" ({displaced.words})"
     relation = pair[2] if len(pair) == 3 else MEET
     tool, scene = (features[name].flat(features) for name in pair[:2])
-    carried = features[pair[1]].on not in WORLD_AND_TOOL
+    on = features[pair[1]].on
+    carrier = carriers.index(on) + 1 if on in carriers else 0
     if not isinstance(relation, str):
         name = f"{pair[0]} at {relation:g}° to {pair[1]}{back}"
-        return Incidence(name, tool, scene, ANGLE, float(relation), carried)
+        return Incidence(name, tool, scene, ANGLE, float(relation), carrier)
     between = {MEET: "on", PARALLEL: "parallel to", PERPENDICULAR: "perpendicular to"}[relation]
     name = f"{pair[0]} {between} {pair[1]}{back}"
-    return Incidence(name, tool, scene, relation, carried=carried)
+    return Incidence(name, tool, scene, relation, carrier=carrier)
 
 
 def _displacement(config: Config) -> StandOff | None:
@@ -302,17 +308,22 @@ def servo_inputs(config: Config, files: Files | None = None) -> ServoInputs:
     )
 
 
-def _carrier(config: Config, files: Files | None) -> CarryingObject | None:
-    """Return the object that the goal is carried by; None for a goal that stands still."""
-    name = None if config.task is None else name_of_carrier(config.task.goal, config.features)
-    if name is None or config.task is None:
-        return None
+def _carriers(config: Config, files: Files | None) -> tuple[CarryingObject, ...]:
+    """Return the objects that the goal is carried by; none for a goal that stands still."""
+    if config.task is None:
+        return ()
+    names = carriers_of(config.task.goal, config.features)
+    return tuple(_carrier(config, files, name, config.task.goal) for name in names)
+
+
+def _carrier(config: Config, files: Files | None, name: str, goal: GoalSettings) -> CarryingObject:
+    """Return an object that a goal is carried by."""
     rendered = config.plant.rendered is not None
     simulated = config.plant.simulated
     return CarryingObject(
         name=name,
         numbers=config.objects.named[name].numbers,
-        taught=config.task.goal.objects.of(name),
+        taught=goal.objects.of(name),
         placed=next((one for one in objects_of(config) if one.name == name), None) if simulated else None,
         at_first=scene_of(config, files, dict.fromkeys(config.objects.named)) if rendered else None,
         driven=None if simulated else _drive(config, None, files),

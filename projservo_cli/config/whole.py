@@ -137,7 +137,7 @@ def _incidences(
 ) -> Iterator[Note]:
     for name, feature in features.items():
         source = None if any(feature.contradictions()) else feature.source
-        if isinstance(source, tuple) and markers is not None:
+        if isinstance(source, tuple) and markers is not None and feature.on == "tool":
             yield from markers.unknown(source, "features", name, feature.kind)
         elif isinstance(source, str):
             of = features.get(source)
@@ -176,14 +176,14 @@ def _objects(
             yield ("objects", name), "is nowhere: give size_m and pose of its tags, or positions_m"
 
 
-def name_of_carrier(goal: Goal, features: Mapping[str, Feature]) -> str | None:
-    """Name of the object that a goal was taught on; None for a goal that stands still, or is a retreat."""
+def carriers_of(goal: Goal, features: Mapping[str, Feature]) -> tuple[str, ...]:
+    """Names of the objects that a goal was taught on; none for one that stands still, or is a retreat."""
     if goal.of_start:
-        return None
+        return ()
     if goal.on is not None:
-        return goal.on
-    on = {features[pair[1]].on for pair in goal.incidences if pair[1] in features}
-    return next(iter(sorted(on - {*WORLD_AND_TOOL})), None)
+        return (goal.on,)
+    on = (features[pair[1]].on for pair in goal.incidences if pair[1] in features)
+    return tuple(name for name in dict.fromkeys(on) if name not in WORLD_AND_TOOL)
 
 
 def _carried(
@@ -194,13 +194,22 @@ def _carried(
     for name, feature in features.items():
         if feature.on not in (*WORLD_AND_TOOL, *objects.named):
             yield ("features", name, "on"), f"there is no object {feature.on}; {known}"
+        elif feature.on in objects.named and not isinstance(feature.source, str):
+            numbers = objects.named[feature.on].numbers
+            others = [number for point in feature.flat(features) for number in point if number not in numbers]
+            if others:
+                yield (
+                    ("features", name, feature.kind),
+                    f"marker {others[0]} is not of {feature.on}: name some of its own, "
+                    f"{', '.join(map(str, numbers))}, or a feature of the tool that was there when taught",
+                )
     for path, goal in ({} if task is None else task.each_goal).items():
-        carrier = name_of_carrier(goal, features)
-        if carrier is not None and carrier in objects.named:
-            numbers = objects.named[carrier].numbers
-            yield from _carried_by(carrier, numbers, ("task", *path), goal, features, plant)
-        elif goal.on is not None:
-            yield ("task", *path, "on"), f"there is no object {carrier}; {known}"
+        for carrier in carriers_of(goal, features):
+            if carrier in objects.named:
+                numbers = objects.named[carrier].numbers
+                yield from _carried_by(carrier, numbers, ("task", *path), goal, features, plant)
+            elif goal.on is not None:
+                yield ("task", *path, "on"), f"there is no object {carrier}; {known}"
 
 
 def _carried_by(
@@ -211,14 +220,13 @@ def _carried_by(
     features: Mapping[str, Feature],
     plant: PlantSettings,
 ) -> Iterator[Note]:
-    """Features that the object of a goal at a path does not carry, and images that do not show it."""
-    held = (carrier,) if goal.on is not None else (carrier, *WORLD_AND_TOOL)
-    for i, pair in enumerate(goal.incidences):
-        if pair[1] in features and (on := features[pair[1]].on) not in held:
+    """Features that are not on the object that a goal at a path names, and images without one."""
+    for i, pair in enumerate(goal.incidences if goal.on is not None else ()):
+        if pair[1] in features and (on := features[pair[1]].on) != carrier:
             yield (
                 (*path, "incidences", i),
-                f"{pair[1]} is on {on}, and the goal on {carrier}: put {pair[1]} on {carrier}"
-                + (", or leave on out, for features on the scene as well" if on == "scene" else ""),
+                f"{pair[1]} is on {on}, and the goal on {carrier}: put {pair[1]} on {carrier}, or leave on "
+                "out, for features on others as well",
             )
     shown = goal.objects.of(carrier)
     if shown is None and (goal.images is not None or not plant.simulated):

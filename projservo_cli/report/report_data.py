@@ -466,11 +466,12 @@ def _plan(run: Run) -> dict[str, Any]:
     """Plain values of a plan, angles in deg, and the smallest margins along it."""
     plan, values = run.plan, scalars_of(run.plan)
     angles = {f"{name}_deg": math.degrees(values.pop(name)) for name in ("theta_r", "theta_p", "theta_s")}
-    of_object = {name.removeprefix("object_"): values.pop(name) for name in _OF_CARRIER}
-    objects, name = {}, of_object.pop("name")
-    if plan.carried is not None:
-        about = {"markers": plan.carried.object_marker, "reason": plan.carried.object_words}
-        objects[name] = of_object | about
+    objects = {}
+    for carried in plan.carried:
+        of_object = {name.removeprefix("object_"): getattr(carried, name) for name in _OF_CARRIER}
+        about = {"markers": carried.object_marker, "reason": carried.object_words}
+        objects[of_object.pop("name")] = of_object | about
+    values = {name: value for name, value in values.items() if name not in _OF_CARRIER}
     nearest = zip(NEAREST, plan.min_margin, plan.min_margin_mu, strict=True)
     return (
         values

@@ -6,7 +6,7 @@ and sag is integrated away.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -85,9 +85,9 @@ class DrivenRobot:
         plant: Plant,
         known: Known,
         monitor: ImageMonitor | None,
-        watch: ObjectWatch | None = None,
+        watches: Sequence[ObjectWatch] = (),
     ) -> None:
-        self.robot, self.steered, self.plant, self.watch = (robot := steered.robot), steered, plant, watch
+        self.robot, self.steered, self.plant, self.watches = (robot := steered.robot), steered, plant, watches
         self.known, self.monitor = known, monitor
         self.markers = len(known.visible)
         self._place = np.array([np.flatnonzero(known.order == i)[0] for i in known.visible])
@@ -138,10 +138,10 @@ class DrivenRobot:
     def observe(self) -> FloatArray:
         """Pixels (V, k, 2) of the markers shown as they will be at rest, NaN where unseen; all are tested."""
         reading, history, order = self.steered.reading, self.steered.history, self.known.order
-        if self.watch is not None:
-            self.watch.observe(reading)
-            if self.watch.moved and not self.disturbance:
-                self.disturbance = self.watch.moved
+        for watch in self.watches:
+            watch.observe(reading)
+            if watch.moved and not self.disturbance:
+                self.disturbance = watch.moved
                 self._retreat()
         if self.monitor is not None:
             _require_apart(self.robot.name, reading)
@@ -208,10 +208,8 @@ class DrivenRobot:
 
     @property
     def object_moved(self) -> bool:
-        """Whether it is the object of the goal that ended the run."""
-        return (
-            self.watch is not None and self.watch.moved is not None and self.disturbance == self.watch.moved
-        )
+        """Whether it is an object of the goal that ended the run."""
+        return any(watch.moved is not None and self.disturbance == watch.moved for watch in self.watches)
 
     def _retreat(self) -> None:
         """Go back the way that it came, by the last joint readings of the run."""

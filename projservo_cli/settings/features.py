@@ -53,15 +53,15 @@ _Plane = Annotated[tuple[Whole, ...], Field(min_length=3, max_length=3)]
 
 
 class Feature(Section):
-    """A point, line or plane of the tool through its markers, or of the scene where that of the tool was."""
+    """A point, line or plane of the tool or an object through its markers, or where that of the tool was."""
 
     on: Name = Field(
         description="what the feature moves with: tool, scene, which stands still, or the name of an object"
     )
     point: Annotated[_Point | Name | None, _numbers_or_name(1, _MOST)] = Field(
         None,
-        description="numbers of markers, whose middle it is; of the scene the point of the tool that was "
-        "there when the goal was taught",
+        description="numbers of markers of the tool or object, whose middle it is; else the point of the "
+        "tool that was there when the goal was taught",
     )
     line: Annotated[_Line | Name | None, _numbers_or_name(2, 2)] = Field(
         None, description="numbers of two markers, in the sense of the line; or as for a point"
@@ -78,9 +78,8 @@ class Feature(Section):
             return
         if self.on == _TOOL and isinstance(self.source, str):
             yield (kinds[0],), "of the tool are numbers of its markers; a name stands for one of the scene"
-        if self.on != _TOOL and not isinstance(self.source, str):
-            of = "the scene" if self.on == _SCENE else self.on
-            yield (kinds[0],), f"of {of} is the name of a feature of the tool that was there when taught"
+        if self.on == _SCENE and not isinstance(self.source, str):
+            yield (kinds[0],), "of the scene is the name of a feature of the tool that was there when taught"
         if isinstance(self.source, tuple) and len(set(self.source)) < len(self.source):
             yield (kinds[0],), "a marker stands here twice"
 

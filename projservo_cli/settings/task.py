@@ -177,6 +177,10 @@ class DisplacedAlong(Section):
         """Return the reason why it is along none of these features; empty if it is along one."""
         if self.along not in features:
             return f"there is no feature {self.along}; features: {', '.join(features) or 'none'}"
+        if features[self.along].on != "tool" and not isinstance(features[self.along].source, str):
+            return (
+                f"{self.along} is of markers of {features[self.along].on}: name a line or plane of the tool"
+            )
         if not features[self.along].given("line", "plane"):
             return f"{self.along} is a point, which has no direction: name a line or a plane"
         return ""

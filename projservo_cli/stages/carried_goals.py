@@ -1,6 +1,7 @@
-"""The object that a goal was taught on: looked at anew, and the goal carried along."""
+"""The objects that a goal was taught on: looked at anew, and the goal carried along."""
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -8,12 +9,12 @@ from projservo_cli import words
 from projservo_cli.calibration.prediction import error_factor_with_model
 from projservo_cli.findings import REFUSES, Finding, Subject
 from projservo_cli.metric.frame import Metric, Scale
-from projservo_cli.records import Calibration, CarriedByObject, InputError, Plan, WorkFailed
+from projservo_cli.records import Calibration, CarriedByObject, FloatArray, InputError, Plan, WorkFailed
 from projservo_cli.robots.session import Session
 from projservo_cli.stages.scenario import Scenario
 from projservo_cli.stages.stage_inputs import CarryingObject, KnownLengths
 from projservo_cli.task.displaced_object import DisplacedObject
-from projservo_cli.task.look_bundle import Look
+from projservo_cli.task.look_bundle import Look, UncertainPoints
 
 
 def in_metres(calibration: Calibration, known: KnownLengths) -> tuple[Metric | None, str]:
@@ -38,17 +39,22 @@ def in_metres(calibration: Calibration, known: KnownLengths) -> tuple[Metric | N
         return None, str(error)
 
 
-def carried_goal(
-    scenario: Scenario, carrier: CarryingObject, before: Plan | None = None, session: Session | None = None
-) -> tuple[Scenario, CarriedByObject]:
-    """Look at the object anew, and carry the goal along: the scenario with it, and what its plan tells of it.
+def carried_by(
+    scenario: Scenario, carriers: Sequence[CarryingObject], before: Plan | None, session: Session | None
+) -> tuple[CarriedByObject, ...]:
+    """Look at objects anew, and carry the goal along with each.
 
-    before : plan to the same goal from elsewhere, for which it was looked at; None to look now.
+    before : plan to the same goal from elsewhere, for which they were looked at; None to look now.
     session : connection to the robot that looks; None for one of its own.
-    Raises WorkFailed where images do not show the object or the goal well enough.
+    Raises WorkFailed where images do not show an object or the goal well enough.
     """
-    if before is not None and before.carried is not None:
-        return scenario.carried(before.carried.s_carried), before.carried
+    if before is not None and before.carried:
+        return before.carried
+    return tuple(_carried(scenario, carrier, session) for carrier in carriers)
+
+
+def _carried(scenario: Scenario, carrier: CarryingObject, session: Session | None) -> CarriedByObject:
+    """Look at an object anew, and carry the goal along with it; arguments as above."""
     c = scenario.world.calibration
     metric, _ = in_metres(c, carrier.lengths)
     taught, now = scenario.world.look(carrier, session, scenario.exact, scenario.q_taught)
@@ -72,6 +78,7 @@ def carried_goal(
         s_object_taught=taught.s,
         sigma_object=now.sigma,
         s_carried=np.ascontiguousarray(goal.s[:, c.indices_of(scenario.world.numbers)]),
+        M_object=_in_body(found, goal.H, carrier.numbers),
     )
     for unit in ("mm", "px"):
         key, at = f"max_goal_deviation_{unit}", getattr(carried, f"goal_deviation_{unit}")
@@ -79,7 +86,22 @@ def carried_goal(
             per, of = {"mm": (1e-3, "m")}.get(unit, (1.0, unit)), Subject(name=key)
             inexact = Finding("carried_inexact", REFUSES, of, per[0] * at, limit=per[0] * most, unit=per[1])
             raise words.failed([inexact], stage=f"objects.{carrier.name}")
-    return scenario.carried(carried.s_carried), carried
+    return carried
+
+
+def markers_now(c: Calibration, carried: CarriedByObject) -> UncertainPoints:
+    """Return the markers of an object of a plan where it is now."""
+    numbers, taught = carried.object_marker.tolist(), carried.s_object_taught
+    assert taught is not None
+    looks = [Look(taught), Look(carried.s_object, carried.sigma_object)]
+    return DisplacedObject.of(c, numbers, looks).markers_now(numbers)
+
+
+def _in_body(found: DisplacedObject, H: FloatArray, numbers: Sequence[int]) -> FloatArray:
+    """Markers (k, 4) of an object in the frame of the body, which the carried goal displaces by H (4, 4)."""
+    M = np.full((len(numbers), 4), np.nan)
+    M[[numbers.index(number) for number in found.marker]] = found.M @ (np.linalg.inv(H) @ found.D).T
+    return M
 
 
 def too_far(carried: CarriedByObject, carrier: CarryingObject) -> Finding | None:

@@ -34,7 +34,7 @@ def connected_robot(
 
     session : which it is opened in, unless it is.
     given : an object of the contract instead of one of a class.
-    plan : of which the object is watched, if its goal is carried by one.
+    plan : of which the objects that carry its goal are watched.
     """
     contract, world, plant = scenario.servo.contract, scenario.world, scenario.plant_of(law)
     assert contract is not None
@@ -46,16 +46,17 @@ def connected_robot(
         visible = np.flatnonzero(np.isin(calibration.marker, scenario.world.observed))
         readings = scenario.termination.max_steps + 1 + WINDOW
         monitor = ImageMonitor(calibration, noise, readings, visible, plant.image_size)
-    watch = None
-    if plan is not None and (carried := plan.carried) is not None:
+    watches = list[ObjectWatch]()
+    for carried in () if plan is None else plan.carried:
         name, numbers = carried.object_name, carried.object_marker.tolist()
         places = np.array([contract.driven.further.index(number) for number in numbers])
         if name not in session.held.values():  # else it moves with the tool
             s, sigma = carried.s_object, carried.sigma_object
             sigma = np.full(s.shape[:2], np.nan) if sigma is None else sigma
-            watch = ObjectWatch(name, numbers, places, s, sigma, images_by_motion(calibration, s))
-    session.at = watch if scenario.world.inputs.displaced is None else None
-    return DrivenRobot(steered, plant, _known_of(scenario, contract, calibration, law), monitor, watch)
+            watches.append(ObjectWatch(name, numbers, places, s, sigma, images_by_motion(calibration, s)))
+    alone = len(watches) == 1 and scenario.world.inputs.displaced is None
+    session.at = watches[0] if alone else None  # of several nobody says which one an action takes
+    return DrivenRobot(steered, plant, _known_of(scenario, contract, calibration, law), monitor, watches)
 
 
 def _known_of(scenario: RunScenario, contract: Contract, calibration: Calibration, law: str) -> Known:

@@ -40,7 +40,7 @@ from projservo_cli.records import (
 )
 from projservo_cli.robots.session import Session
 from projservo_cli.settings.task import Trajectory
-from projservo_cli.stages.carried_goals import carried_goal
+from projservo_cli.stages.carried_goals import carried_by
 from projservo_cli.stages.motions import (
     Found,
     JointSearch,
@@ -144,9 +144,8 @@ def run(
     scenario = scenario_of(inputs, calibration)
     if not scenario.untested:
         _require_taught_since(scenario, calibration)
-    carried = None
-    if inputs.carrier is not None:
-        scenario, carried = carried_goal(scenario, inputs.carrier, before, session)
+    carried = carried_by(scenario, inputs.carriers, before, session)
+    scenario = scenario.carried(carried)
     plan = _to_any_goal(scenario) if inputs.incidences else _plan_in(scenario)
     face = metric_points(scenario.world.model, calibration.M[calibration.indices_of(inputs.face)])
     further = (
@@ -176,8 +175,9 @@ def _to_any_goal(scenario: Scenario) -> Plan:
     """
     model, ends = scenario.world.model, scenario.ends
     H_taught, shows = ends.displacements_taught(model), np.isfinite(ends.s_star[..., 0])
+    scenes = ends.scenes(H_taught)
     asked, sigma_px = ends.goal.incidences, scenario.goal_error_px
-    apart = tuple(contradictions(model, ends.body, H_taught, asked, shows, sigma_px))
+    apart = tuple(contradictions(model, ends.body, H_taught[0], scenes, asked, shows, sigma_px))
     if not usable(apart):
         raise failed([one for one in apart if one.severity == REFUSES])
     state, task, _, _ = _partitioned(model, ends, scenario.world.inputs.trajectory, scenario.demands.limits)

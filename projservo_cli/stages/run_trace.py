@@ -37,6 +37,7 @@ from projservo_cli.records import (
 )
 from projservo_cli.simulation.analytic_plant import rig_distance
 from projservo_cli.simulation.faults import obstruction_of
+from projservo_cli.stages.carried_goals import markers_now
 from projservo_cli.stages.law_run import LawRun
 from projservo_cli.task.body import SETTLED, fit_body
 from projservo_cli.task.face import Task
@@ -45,6 +46,7 @@ from projservo_cli.task.incidences import (
     errors_px,
     free_motions,
     images_of,
+    points_of,
 )
 from projservo_cli.task.look_bundle import Look
 from projservo_cli.task.target import TaskImages
@@ -204,8 +206,8 @@ def _stated_mm(run: LawRun) -> dict[str, Any]:
         every = np.zeros((len(scenario.world.view), len(calibration.marker)), dtype=np.bool_)
         every[:, calibration.indices_of(numbers)] = used
         found["undetected_position_error_mm"] = run.driven.monitor.undetected_mm(q, every, posture)
-    if isinstance(run.plan, Plan) and run.plan.carried is not None:
-        parts.append(run.plan.carried.goal_deviation_mm or 0.0)
+    if isinstance(run.plan, Plan) and run.plan.carried:
+        parts += [one.goal_deviation_mm or 0.0 for one in run.plan.carried]
     elif (goal := scenario.goal_pixels) is not None:
         parts.append(rigid_fit(calibration, q, *goal).off_mm(posture, calibration.M))
     return found | {"estimated_position_error_mm": float(np.linalg.norm([*parts, *found.values()]))}
@@ -240,11 +242,11 @@ def _incidences(run: LawRun) -> IncidenceHistory | None:
             H[k] = as_array(fit.H)
     taught = images.displacements_taught(model)
     there = H[-1] if _credible(run) else np.full_like(H[-1], np.nan)
-    left, each = _incidence_errors(run, images, there, taught), np.arange(len(taught))
-    flats = [[one.tool for one in images.goal.incidences], [one.scene for one in images.goal.incidences]]
+    left = _incidence_errors(run, images, there, taught)
+    tools = [points_of(task.body.M, one.tool) for one in images.goal.incidences]
     return IncidenceHistory(
-        feature_s=images_of(model, task.body.M, flats[0], H),
-        feature_s_star=images_of(model, task.body.M, flats[1], taught)[each, each],
+        feature_s=images_of(model, tools, H),
+        feature_s_star=images_of(model, images.scenes(taught), np.eye(4)[None])[0],
         incidence_mm=np.hypot(left.mm, left.deviation_mm),
         incidence_deg=np.hypot(left.deg, left.deviation_deg),
         incidence_deviation_mm=left.deviation_mm,
@@ -273,21 +275,24 @@ def _incidence_errors(run: LawRun, images: TaskImages, H: FloatArray, taught: Fl
     taught : (g, 4, 4) displacements of the body where each was taught.
     """
     scenario, world, plan = run.scenario, run.scenario.world, run.plan
-    on_object = plan.carried if isinstance(plan, Plan) else None
+    objects = plan.carried if isinstance(plan, Plan) else ()
     s, shown = np.full_like(images.s_star, np.nan), run.log.s[run.steps]
     s[:, : shown.shape[1]] = shown  # of a law that measures points those of the face alone
     now = Look(s, np.full(s.shape[:2], max(world.noise_px, _EXACT_PX)))
     found, markers = np.full((4, len(taught)), np.nan), world.calibration.indices_of(world.numbers)
-    for carried in {one.carried for one in images.goal.incidences}:
-        own = [k for k, one in enumerate(images.goal.incidences) if one.carried == carried]
-        there = images.goal.carried if carried else images.goal.taught
-        sigma, more = scenario.goal_sigma_px, tuple[float, ...]()
-        if carried and on_object is not None:  # its images are predicted: their deviation is stated besides
-            sigma = 0.0
-            more = on_object.goal_deviation_mm or 0.0, on_object.goal_deviation_deg or 0.0
-        goal = Look(there, np.full(s.shape[:2], max(sigma, _EXACT_PX)))
-        ends = TaughtAndNow(goal, now, taught[own[0]], H, *more)
-        asked = [images.goal.incidences[k] for k in own]
+    for carrier in images.goal.carriers:
+        own = [k for k, one in enumerate(images.goal.incidences) if one.carrier == carrier]
+        place, sigma, more = images.goal.place(carrier), scenario.goal_sigma_px, (0.0, 0.0)
+        if carrier and objects:  # its images are predicted: their deviation is stated besides
+            of, sigma = objects[carrier - 1], 0.0
+            more = of.goal_deviation_mm or 0.0, of.goal_deviation_deg or 0.0
+        goal, asked = (
+            Look(place.s, np.full(s.shape[:2], max(sigma, _EXACT_PX))),
+            [images.goal.incidences[k] for k in own],
+        )
+        shown = all(one.shown_by(range(len(markers))) for one in asked)
+        points = None if shown else markers_now(world.calibration, objects[carrier - 1])
+        ends = TaughtAndNow(goal, now, taught[own[0]], H, *more, points)
         found[:, own] = incidence_errors(world.calibration, markers, asked, ends, world.inputs.lengths)
     return IncidenceErrors(*found)
 

@@ -26,6 +26,7 @@ from projservo_cli.records import (
     TOOL,
     WORLD,
     Calibration,
+    CarriedByObject,
     FloatArray,
     InputError,
     IntArray,
@@ -35,13 +36,13 @@ from projservo_cli.records import (
 )
 from projservo_cli.simulation.analytic_plant import Ends, Plant
 from projservo_cli.simulation.workspace import Truth
-from projservo_cli.stages.stage_inputs import PlanInputs, ServoInputs
+from projservo_cli.stages.stage_inputs import CarryingObject, PlanInputs, ServoInputs
 from projservo_cli.stages.worlds.calibrated import CalibratedWorld, measures_points, observed_numbers
 from projservo_cli.stages.worlds.simulated import RenderedWorld, SimulatedWorld
 from projservo_cli.stages.worlds.task_images import given_pixels, in_body, positioned
 from projservo_cli.task.incidences import Incidence
 from projservo_cli.task.stand_off import displacement_back
-from projservo_cli.task.target import TaskImages, is_stereo
+from projservo_cli.task.target import Place, TaskImages, is_stereo
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +56,7 @@ class Scenario:
     goal_joints: FloatArray  # (k, n) joints at which the goal is shown, rad or m; k is 0 if unknown
     # (V, b, 2) images of the goal that was chosen among those of the incidences, px; None for the taught one
     s_chosen: FloatArray | None = None
-    s_carried: FloatArray | None = None  # (V, b, 2) images of the taught goal where its object is now, px
+    objects: tuple[Place, ...] = ()  # the taught goal where its objects have it now
 
     @cached_property
     def ends(self) -> TaskImages:
@@ -80,23 +81,25 @@ class Scenario:
 
     def towards(self, plan: Plan) -> Self:
         """Return the scenario with the goal that a plan carried along, or chose among those of incidences."""
-        found = self if plan.carried is None else self.carried(plan.carried.s_carried)
-        if plan.open_goal is None and plan.carried is None:
+        found = self.carried(plan.carried)
+        if plan.open_goal is None and not plan.carried:
             return found
         end = plan.q[-1:] if np.isfinite(plan.q[-1:]).all() else self.goal_joints[:0]
         chosen = None if plan.open_goal is None else plan.open_goal.s_goal
         return replace(found, s_chosen=chosen, goal_joints=end)
 
-    def carried(self, s: FloatArray) -> Self:
-        """Return the scenario with a goal that was carried along, of which no joints are known.
-
-        s : (V, b, 2) its images, px.
-        """
-        exact = self.exact
+    def carried(self, objects: Sequence[CarriedByObject]) -> Self:
+        """Return the scenario with a goal that objects carried along, of which no joints are known."""
+        if not objects:
+            return self
+        exact, none = self.exact, np.zeros((0, 4))
+        places = tuple(
+            Place(one.s_carried, none if one.M_object is None else one.M_object) for one in objects
+        )
         if len(exact.q_near):
-            shown = exact._replace(goal=exact.goal.carried_to(s))
+            shown = exact._replace(goal=exact.goal.carried_to(places))
             exact = exact._replace(q_near=_joints_near_goal(self.world, shown, None))
-        return replace(self, s_carried=s, exact=exact, goal_joints=self.goal_joints[:0])
+        return replace(self, objects=places, exact=exact, goal_joints=self.goal_joints[:0])
 
     def images_for(self, law: str) -> TaskImages:
         """Start and goal as a law measures them: with the body, or point by point."""
@@ -179,8 +182,8 @@ class Scenario:
     def images_at(self, seed: int) -> TaskImages:
         """Start and goal as the images of a seed show them; a goal may be carried along, then displaced."""
         images, asked = self.world.shown(self.exact, self.q_taught, seed), self.world.inputs.displaced
-        if self.s_carried is not None:
-            images = images._replace(goal=images.goal.carried_to(self.s_carried))
+        if self.objects:
+            images = images._replace(goal=images.goal.carried_to(self.objects))
         if asked is None:
             return images
         self.world.require_body("a goal is displaced")
@@ -266,7 +269,7 @@ def scenario_of(inputs: PlanInputs, calibration: Calibration) -> Scenario:
         world.require_body("incidences are measured")
     exact, q_goal = world.ends(task)
     exact = exact._replace(body=world.body, view=world.view)
-    exact = exact.asking(_positions(inputs.incidences, world.numbers))
+    exact = exact.asking(_positions(inputs.incidences, world.numbers, inputs.carriers))
     if not is_stereo(world.view):
         exact = exact._replace(q_near=_joints_near_goal(world, exact, q_goal))
     exact = exact._replace(least_views=world.least_views)
@@ -274,13 +277,20 @@ def scenario_of(inputs: PlanInputs, calibration: Calibration) -> Scenario:
     return Scenario(world, exact, world.true_ends(exact, q_goal), q_goal, joints)
 
 
-def _positions(asked: Sequence[Incidence], numbers: Sequence[int]) -> tuple[Incidence, ...]:
-    """Incidences by positions in the body instead of numbers of markers; raises as ``in_body``."""
-    names = [f"task.goal.incidences: {one.name}" for one in asked]
-    return tuple(
-        one._replace(tool=in_body(one.tool, numbers, name), scene=in_body(one.scene, numbers, name))
-        for one, name in zip(asked, names, strict=True)
-    )
+def _positions(
+    asked: Sequence[Incidence], numbers: Sequence[int], carriers: Sequence[CarryingObject]
+) -> tuple[Incidence, ...]:
+    """Incidences by positions in the body instead of numbers of markers; raises as ``in_body``.
+
+    Markers of the object of a feature come after those of the body.
+    """
+    found = list[Incidence]()
+    for one in asked:
+        name = f"task.goal.incidences: {one.name}"
+        own = carriers[one.carrier - 1].numbers if one.carrier else ()
+        scene = in_body(one.scene, (*numbers, *own), name)
+        found.append(one._replace(tool=in_body(one.tool, numbers, name), scene=scene))
+    return tuple(found)
 
 
 def run_scenario(inputs: ServoInputs, calibration: Calibration) -> RunScenario:

@@ -99,5 +99,5 @@ def sense_is_enough(inputs: ServoInputs, name: str) -> bool:
     law, mode = law_and_mode(name)
     asked = inputs.plan
     # Any other goal than a pose needs that of the plan.
-    pose = law != INCIDENCES and not asked.incidences and asked.carrier is None
+    pose = law != INCIDENCES and not asked.incidences and not asked.carriers
     return mode == REGULATE and _in_compiled_loop(inputs, law) and pose

@@ -220,7 +220,7 @@ class PlanInputs:
     # Width and height to which recorded images reach at least, px, where their size is not known.
     seen_px: ImageSize | None = None
     # Object that the goal was taught on; None for a goal that stands still.
-    carrier: "CarryingObject | None" = None
+    carriers: "tuple[CarryingObject, ...]" = ()
     displaced: StandOff | None = None  # of the goal, or of the start in its place
     q_current: FloatArray | None = None  # (n,) joints where the arm stands, rad or m, once that is known
 

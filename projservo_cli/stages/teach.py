@@ -250,6 +250,7 @@ def checked(inputs: PlanInputs, calibration: Calibration, taught: _Taught) -> _C
     within = np.clip(taught.q, joints.limits.lower, joints.limits.upper)
     start = JointVector(joints=within.tolist(), unit="rad")
     limits = np.concatenate([joints.limits.lower, joints.limits.upper, joints.limits.speed])
+    markers = calibration.marker.tolist()
     # No path is searched for joints whose limits are not known: the arm stands at the goal as it is.
     profile = "joint_space" if np.isfinite(limits).all() else "linear"
     border = inputs.trajectory.border_px + 1.0  # beyond what the goal shows, where the size is not known
@@ -258,7 +259,8 @@ def checked(inputs: PlanInputs, calibration: Calibration, taught: _Taught) -> _C
         inputs,
         seen_px=tuple((width, height) for width, height in seen_px),
         task=TaskSettings(start=start, goal=Goal(images=taught.images)),
-        carrier=None,
+        incidences=tuple(one._replace(carrier=0) for one in inputs.incidences if one.shown_by(markers)),
+        carriers=(),
         displaced=None,
         trajectory=inputs.trajectory.model_copy(update={"profile": profile, "keep_out": ()}),
     )

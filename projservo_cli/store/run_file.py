@@ -18,7 +18,7 @@ import os
 import re
 import shutil
 import typing
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
@@ -46,8 +46,10 @@ from projservo_cli.records import (
     composed,
     flat_fields,
     has_default,
+    is_list,
     is_optional,
     optional_names,
+    part_of,
     scalars_of,
 )
 from projservo_cli.words import line, sentence, setup_of
@@ -353,7 +355,7 @@ def attribute(group: h5py.Group, name: str, kind: type = object) -> Any:
 
 
 def save_record(group: "h5netcdf.Group", record: Any) -> None:
-    """Store each field of a record that is not None."""
+    """Store each field of a record that is not None; of a list the parts after the first as groups."""
     group.attrs["record"] = type(record).__name__
     sizes, arrays = dict(SIZES), {}
     for field in flat_fields(type(record)):
@@ -376,10 +378,18 @@ def save_record(group: "h5netcdf.Group", record: Any) -> None:
         data.attrs.update({"units": field.metadata["units"], "long_name": field.metadata["about"]})
         if boolean:  # netCDF has no booleans; xarray marks them so
             data.attrs["dtype"] = "bool"
+    for entry in filter(is_list, dataclasses.fields(record)):
+        for place, part in _further(entry.name, getattr(record, entry.name)):
+            save_record(group.create_group(place), part)
     if isinstance(record, Trace):  # a coordinate, which reading makes of the period again
         seconds = record.period * np.arange(sizes["time"])
         time = group.create_variable("time", ("time",), data=seconds, **_checked(seconds))
         time.attrs.update({"units": "s", "long_name": "time since the first instant"})
+
+
+def _further(name: str, parts: Sequence[Any]) -> Iterator[tuple[str, Any]]:
+    """Parts of a list after the first, with the names of their groups."""
+    return ((f"{name}_{k}", part) for k, part in enumerate(parts[1:], 2))
 
 
 def dataset_of(record: Any) -> Any:
@@ -425,6 +435,8 @@ def load_record(group: h5py.Group, kind: Any, sizes: dict[str, int]) -> Any:
     own, lacking = dict(sizes), optional_names(kind)
     views = attribute(group, "view", list) if "view" in group.attrs else VIEWS
     values: dict[str, Any] = {}
+    lists: dict[str, Any] = {}
+    groups: set[str] = set()
     for field in flat_fields(kind):
         name, dims, optional = field.name, field.metadata.get("dims"), is_optional(field)
         inner = typing.get_args(field.type)[0] if optional else field.type
@@ -440,7 +452,12 @@ def load_record(group: h5py.Group, kind: Any, sizes: dict[str, int]) -> Any:
             values[name] = _value(name, attribute(group, name), inner)
         else:
             values[name] = _array(_member(group, name), dims, inner, own)
-    _require_names(group, {*values, *own})
+    for entry in filter(is_list, dataclasses.fields(kind)):
+        more = dict[str, Any]()
+        while (place := f"{entry.name}_{len(more) + 2}") in group:
+            more[place] = load_record(group[place], part_of(entry), dict(sizes))
+        lists[entry.name], groups = tuple(more.values()), {*groups, *more}
+    _require_names(group, {*values, *own, *groups})
     if "view" in values and len(values["view"]) != own.get("view", len(values["view"])):
         raise ValueError(f"{group.name} has arrays of {own['view']} views, named {', '.join(views)}")
     if "joint" in own:
@@ -449,7 +466,7 @@ def load_record(group: h5py.Group, kind: Any, sizes: dict[str, int]) -> Any:
         raise ValueError(f"joint_types are not {own['joint']} letters R and P")
     if values.get("method") == "closed_form":  # it has no covariance, which all others have
         raise ValueError("its calibration is by the method closed_form, which is retired")
-    record = composed(kind, values)
+    record = composed(kind, values | lists)
     if "findings" in values and "findings" not in group.attrs:
         return changed(record, findings=_told(record))
     return record

@@ -27,20 +27,21 @@ _NEGLIGIBLE_PX = 1e-3
 def contradictions(
     model: Model,
     body: Body,
-    H_taught: FloatArray,
+    H: FloatArray,
+    scenes: Sequence[FloatArray],
     asked: Sequence[Incidence],
     shows: BoolArray,
     sigma_px: float,
 ) -> Iterator[Finding]:
     """Yield the pairs of incidences that contradict each other, or all of them, where no pair does.
 
-    H_taught : (4, 4) displacement of the body where the goal was taught, or (g, 4, 4) one for each incidence.
+    H : (4, 4) displacement of the body beside which places are sought.
+    scenes : for each incidence the points (…, 4) that span its feature of the scene.
     shows : (V, m) markers that images show there.
     sigma_px : deviation of a coordinate by images and calibration, px.
     Raises as ``incidences_of`` and ``weighted``.
     """
-    H = np.broadcast_to(H_taught, (len(asked), 4, 4))[0]
-    each = each_in_pixels(incidences_of(model, body, H_taught, asked), model, body, H, shows)
+    each = each_in_pixels(incidences_of(model, body, scenes, asked), model, body, H, shows)
     numbers, sigma_px = range(len(asked)), max(sigma_px, _NEGLIGIBLE_PX)
     if (apart := _apart(each, body, H, numbers)) <= _TOLD * sigma_px:
         return

@@ -34,7 +34,15 @@ from projservo_cli.records import (
     IntArray,
     WorkFailed,
 )
-from projservo_cli.task.look_bundle import Bundle, BundleFit, Look, LookRig, differ, unknown
+from projservo_cli.task.look_bundle import (
+    Bundle,
+    BundleFit,
+    Look,
+    LookRig,
+    UncertainPoints,
+    differ,
+    unknown,
+)
 
 # Number of markers that six coordinates need, and that twelve need; findings on it by these numbers.
 RIGID, _AFFINE = 3, 4
@@ -403,6 +411,15 @@ class DisplacedObject:
             left_out=left_out,
             _rig=rig,
             _fit=fit,
+        )
+
+    def markers_now(self, numbers: Sequence[int]) -> UncertainPoints:
+        """Return some of its markers (k,) where they are now, NaN where unseen, in the frame of the looks."""
+        found = self._fit.points_at(len(self._fit.T) - 1, self._rig)
+        at = [self.marker.index(number) if number in self.marker else -1 for number in numbers]
+        unseen = np.array(at) < 0
+        return UncertainPoints(
+            *(np.where(unseen[:, None], np.nan, found.X[at]), found.by_images[at], found.by_calibration[at])
         )
 
     def carry(self, goal: Look | FloatArray) -> _CarriedGoal:

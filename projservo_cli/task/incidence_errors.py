@@ -15,8 +15,8 @@ from projservo_cli.geometry.displacements import generators
 from projservo_cli.metric.frame import changes_of
 from projservo_cli.monitoring.accuracy import metres_by
 from projservo_cli.records import MEET, MM, PARALLEL, PERPENDICULAR, Calibration, FloatArray, WorkFailed
-from projservo_cli.task.incidences import Incidence
-from projservo_cli.task.look_bundle import BundleFit, Look, LookRig
+from projservo_cli.task.incidences import Flat, Incidence
+from projservo_cli.task.look_bundle import BundleFit, Look, LookRig, UncertainPoints
 
 # Angle between features, rad, by their relation.
 _WANTED = {MEET: 0.0, PARALLEL: 0.0, PERPENDICULAR: 0.5 * np.pi}
@@ -84,6 +84,7 @@ class TaughtAndNow(NamedTuple):
     H: FloatArray  # H_taught, H: (4, 4) in the calibrated frame
     taught_mm: float = 0.0
     taught_deg: float = 0.0  # taught_mm, taught_deg: deviation of the goal besides that by its images
+    of_object: UncertainPoints | None = None  # markers of the object that carries the goal, where it is now
 
 
 class IncidenceErrors(NamedTuple):
@@ -103,38 +104,71 @@ class Placed(NamedTuple):
     E: FloatArray  # (6, 4, 4) generators of steps of them
     unit_mm: FloatArray  # (B,) mm in a unit; 1 where no length is known
     errors: tuple[FloatArray, FloatArray]  # (6, ...) of each displacement, by independent errors
+    of_object: UncertainPoints | None  # markers where they are, whose positions come after those of the body
 
-    def vectors(self, one: Incidence, M: FloatArray, T: FloatArray, unit_mm: FloatArray) -> FloatArray:
-        """Vectors (..., c) of an incidence, mm, then rad, of markers (..., k, 4) at (..., 2, 4, 4)."""
-        at = Separation.of(one, *_features(one, M, T))
+    def on_object(self, one: Incidence) -> bool:
+        """Whether the feature of the scene is of the markers of the object, and none that was taught."""
+        return not one.shown_by(range(self.M.shape[1]))
+
+    def features(
+        self,
+        one: Incidence,
+        M: FloatArray | None = None,
+        T: FloatArray | None = None,
+        X: FloatArray | None = None,
+    ) -> tuple[FloatArray, FloatArray]:
+        """Points (..., l, 3) that span the feature of the tool, and that of the scene.
+
+        Of markers M (..., k, 4) at T (..., 2, 4, 4), and X (..., o, 4) of the object; as found if not given.
+        """
+        M, T = self.M[0] if M is None else M, self.T if T is None else T
+        tool = _spanning(M, one.tool) @ np.swapaxes(T[..., 1, :, :], -1, -2)
+        if not self.on_object(one):
+            return tool[..., :3], (_spanning(M, one.scene) @ np.swapaxes(T[..., 0, :, :], -1, -2))[..., :3]
+        assert self.of_object is not None
+        own = tuple(tuple(number - M.shape[-2] for number in point) for point in one.scene)
+        return tool[..., :3], _spanning(self.of_object.X if X is None else X, own)[..., :3]
+
+    def vectors(self, one: Incidence, unit_mm: FloatArray, **of: FloatArray) -> FloatArray:
+        """Vectors (..., c) of an incidence, mm, then rad, of markers as of ``features``."""
+        at = Separation.of(one, *self.features(one, **of))
         apart = unit_mm[..., None, None] * at.apart
         return np.concatenate([apart.reshape(*apart.shape[:-2], -1), at.turned], axis=-1)
 
     def changes(self, one: Incidence) -> FloatArray:
         """Changes (c, ...) of these by independent errors of unit variance."""
-        shared = changes_of(self.vectors(one, self.M, self.T[None], self.unit_mm)).T
-        apart = [self.by_motion(one, k) @ errors for k, errors in enumerate(self.errors)]
+        shared = changes_of(self.vectors(one, self.unit_mm, M=self.M, T=self.T[None])).T
         c = shared.shape[1]  # errors of the calibration come first, and are common
-        own = [part[:, c:] for part in apart]
-        return np.hstack([shared + apart[0][:, :c] + apart[1][:, :c], *own])
+        apart = [self.by_motion(one, 1) @ self.errors[1]]
+        if self.on_object(one):
+            assert self.of_object is not None
+            errors = np.concatenate([self.of_object.by_calibration, self.of_object.by_images], axis=2)
+            apart.append(self.by_points(one) @ errors.reshape(-1, errors.shape[2]))
+        else:
+            apart.append(self.by_motion(one, 0) @ self.errors[0])
+        return np.hstack([shared + sum(part[:, :c] for part in apart), *(part[:, c:] for part in apart)])
 
     def by_motion(self, one: Incidence, which: int) -> FloatArray:
         """Derivatives (c, 6) by steps of one of both displacements."""
         steps = expm(_STEP * np.concatenate([self.E, -self.E]))
         T = np.broadcast_to(self.T, (len(steps), *self.T.shape)).copy()
         T[:, which] = T[:, which] @ steps
-        up, down = np.split(self.vectors(one, self.M[0], T, self.unit_mm[:1]), 2)
+        up, down = np.split(self.vectors(one, self.unit_mm[:1], T=T), 2)
+        return np.asarray((up - down).T / (2.0 * _STEP))
+
+    def by_points(self, one: Incidence) -> FloatArray:
+        """Derivatives (c, 3 o) by coordinates of the markers of the object."""
+        assert self.of_object is not None
+        X = self.of_object.X
+        steps = np.zeros((3 * len(X), *X.shape))
+        steps[:, :, :3] = _STEP * np.eye(3 * len(X)).reshape(-1, len(X), 3)
+        up, down = np.split(self.vectors(one, self.unit_mm[:1], X=np.concatenate([X + steps, X - steps])), 2)
         return np.asarray((up - down).T / (2.0 * _STEP))
 
 
-def _features(one: Incidence, M: FloatArray, T: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Points (..., k, 3) that span the feature of the tool, and that of the scene; arguments as above."""
-    tool, scene = (
-        np.stack([M[..., list(numbers), :].mean(axis=-2) for numbers in flat], axis=-2)
-        for flat in (one.tool, one.scene)
-    )
-    there, here = (np.swapaxes(T[..., k, :, :], -1, -2) for k in range(2))
-    return (tool @ here)[..., :3], (scene @ there)[..., :3]
+def _spanning(M: FloatArray, flat: Flat) -> FloatArray:
+    """Points (..., l, 4) that span a feature of markers (..., k, 4)."""
+    return np.stack([M[..., list(numbers), :].mean(axis=-2) for numbers in flat], axis=-2)
 
 
 @lru_cache(maxsize=8)
@@ -156,7 +190,8 @@ def placed_by(rig: LookRig, markers: Sequence[int], ends: TaughtAndNow, unit_mm:
         for look, H in ((ends.taught, ends.H_taught), (ends.now, ends.H))
     ]
     errors = [np.hstack(fit.errors(rig, M)[::-1]) for fit in fits]
-    return Placed(M, np.concatenate([fit.T for fit in fits]), E, unit_mm, (errors[0], errors[1]))
+    T = np.concatenate([fit.T for fit in fits])
+    return Placed(M, T, E, unit_mm, (errors[0], errors[1]), ends.of_object)
 
 
 def incidence_errors(
@@ -179,15 +214,16 @@ def incidence_errors(
     known = np.isfinite(unit[0])
     placed = placed_by(rig, markers, ends, unit if known else np.ones(len(unit)))
     for row, one in zip(found, asked, strict=True):
-        tool, scene = _features(one, placed.M[0], placed.T)
+        tool, scene = placed.features(one)
+        taught_mm, taught_deg = (0.0, 0.0) if placed.on_object(one) else (ends.taught_mm, ends.taught_deg)
         apart, turned = Separation.of(one, tool, scene)
         variance = np.square(placed.changes(one)).sum(axis=1)
         if apart.size and known:
             off = unit[0] * np.linalg.norm(apart, axis=1)
             k = int(np.argmax(off))
             at_point = variance[: apart.size].reshape(-1, 3)[k].sum()
-            row[0], row[2] = off[k], np.hypot(np.sqrt(at_point), ends.taught_mm)
+            row[0], row[2] = off[k], np.hypot(np.sqrt(at_point), taught_mm)
         if turned.size:
             row[1] = np.degrees(angle_off(one, tool, scene))
-            row[3] = np.hypot(np.degrees(np.sqrt(variance[apart.size :].sum())), ends.taught_deg)
+            row[3] = np.hypot(np.degrees(np.sqrt(variance[apart.size :].sum())), taught_deg)
     return IncidenceErrors(*found.T)

@@ -13,7 +13,7 @@ vision system?", International Journal of Computer Vision 35, 1999, for what can
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -64,10 +64,14 @@ class Incidence(NamedTuple):
 
     name: str  # as messages and figures write it
     tool: Flat  # one, two or three points that span it
-    scene: Flat  # the feature of the tool that was there when the goal was taught
+    scene: Flat  # the feature of the tool that was there when the goal was taught, or of the object itself
     relation: str = MEET
     angle_deg: float = math.nan  # between both, for ``ANGLE``
-    carried: bool = False  # whether the feature of the scene moves with the object of the goal
+    carrier: int = 0  # of the feature of the scene, by places of the goal: the scene, then objects
+
+    def shown_by(self, markers: Collection[int]) -> bool:
+        """Whether the feature of the scene is where one of the tool was, which has these markers."""
+        return all(number in markers for point in self.scene for number in point)
 
 
 class Incidences(NamedTuple):
@@ -215,14 +219,14 @@ def points_of(M: FloatArray, flat: Flat) -> FloatArray:
     return np.array([M[list(numbers)].mean(axis=0) for numbers in flat])
 
 
-def images_of(model: Model, M: FloatArray, flats: Sequence[Flat], H: FloatArray) -> FloatArray:
-    """Images (k, g, 3, V, 2) of the points that span features of markers (m, 4) at displacements (k, 4, 4).
+def images_of(model: Model, features: Sequence[FloatArray], H: FloatArray) -> FloatArray:
+    """Images (k, g, 3, V, 2) of the points (…, 4) that span features, at displacements (k, 4, 4).
 
     NaN beyond the points of a feature, and where a displacement is.
     """
-    points = np.full((len(flats), len(KINDS), 4), math.nan)
-    for spanned, flat in zip(points, flats, strict=True):
-        spanned[: len(flat)] = points_of(M, flat)
+    points = np.full((len(features), len(KINDS), 4), math.nan)
+    for spanned, own in zip(points, features, strict=True):
+        spanned[: len(own)] = own
     pixels = project(model.P, np.einsum("kab,gsb->kgsa", H, points), model.lens)
     return np.ascontiguousarray(np.moveaxis(pixels, 0, -2))
 
@@ -317,18 +321,24 @@ def _has_sense(one: Incidence, tool: FloatArray, scene: FloatArray) -> bool:
     return one.relation in (MEET, PARALLEL) and len(tool) == len(scene) > 1
 
 
-def incidences_of(model: Model, body: Body, H_taught: FloatArray, asked: Sequence[Incidence]) -> Incidences:
+def incidences_of(
+    model: Model, body: Body, scenes: Sequence[FloatArray], asked: Sequence[Incidence]
+) -> Incidences:
     """Rows of incidences, in the frame of a model, not weighted yet.
 
-    H_taught : (4, 4) displacement of the body where the goal was taught, or (g, 4, 4) one for each incidence.
+    scenes : for each incidence the points (…, 4) that span its feature of the scene.
     Raises InputError for angles whose metric the joints leave open, WorkFailed for points that span no line
-    or plane.
+    or plane, or that no camera has shown.
     """
     rows, senses = list[FloatArray](), [NO_INCIDENCES.senses]
-    for k, (one, H) in enumerate(zip(asked, np.broadcast_to(H_taught, (len(asked), 4, 4)), strict=True)):
+    for k, (one, scene) in enumerate(zip(asked, scenes, strict=True)):
         tool = points_of(body.M, one.tool)
-        scene = points_of(body.M, one.scene) @ H.T
         for points in (tool, scene):
+            if not np.isfinite(points).all():
+                raise WorkFailed(
+                    f"incidence {one.name}: fewer than two cameras see all markers of its feature of the "
+                    "scene: name others, or let two see these"
+                )
             if np.linalg.matrix_rank(points / np.linalg.norm(points, axis=1)[:, None], 1e-6) < len(points):
                 raise WorkFailed(
                     f"incidence {one.name}: its points span no {KINDS[len(points) - 1]}: name others"

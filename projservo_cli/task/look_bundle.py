@@ -250,6 +250,14 @@ def differ(X: FloatArray, Y: FloatArray) -> bool:
     return bool(np.linalg.norm(X - Y, axis=1).max() > _SAME * size)
 
 
+class UncertainPoints(NamedTuple):
+    """Points in the frame of a rig, and their changes by independent errors of unit variance."""
+
+    X: FloatArray  # (k, 4)
+    by_images: FloatArray  # (k, 3, N)
+    by_calibration: FloatArray  # (k, 3, c)
+
+
 @dataclass(frozen=True, eq=False)
 class BundleFit:
     """Points of a body and its displacements at some looks."""
@@ -302,6 +310,18 @@ class BundleFit:
         """
         by_images = self.inverse_hessian @ self.linearized()[1].T
         return by_images, -by_images @ self.moved(rig, X)
+
+    def points_at(self, look: int, rig: LookRig) -> "UncertainPoints":
+        """Return the points at a look, with their errors."""
+        T, (k, p) = self.T[look], (len(self.X), self.linearized()[1].shape[1])
+        J = np.zeros((k, 3, p))
+        for i in range(k if self.bundle.free else 0):
+            J[i, :, 3 * i : 3 * i + 3] = T[:3, :3]
+        if look != self.bundle.fixed:
+            velocity = np.einsum("ij,gjm,km->kig", T, self.bundle.E, self.X)
+            J[..., self.bundle.columns(look, k)] = velocity[:, :3]
+        by_images, by_calibration = (J @ errors for errors in self.errors(rig, self.X))
+        return UncertainPoints(self.X @ T.T, by_images, by_calibration)
 
     def unseen(self, look: int) -> tuple[float, FloatArray]:
         """Largest deviation of the linear part of a displacement by the noise, and its direction."""

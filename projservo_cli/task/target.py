@@ -37,6 +37,7 @@ from projservo_cli.task.incidences import (
     image_velocities,
     incidences_of,
     nearest_goal,
+    points_of,
     weighted,
 )
 from projservo_cli.task.partition import Split, partition
@@ -57,30 +58,43 @@ def is_stereo(view: Sequence[str]) -> bool:
     return len(view) == len(VIEWS)
 
 
+class Place(NamedTuple):
+    """Pose of the body that was taught, where its carrier, the scene or an object, has it now."""
+
+    s: FloatArray  # (V, b, 2) px of the body
+    # (k, 4) markers of the object in the frame of the body, NaN where unseen; none of the scene
+    M: FloatArray = np.zeros((0, 4))
+
+
 class Goal(NamedTuple):
-    """What is to hold at the end: incidences, each where its carrier has it, or the whole pose of the face.
+    """What is to hold at the end: incidences, each where its carrier has it, or the whole pose."""
 
-    Its images are those of the body at the pose that was taught.
-    """
-
-    taught: FloatArray  # (V, b, 2) px where it was taught, on the scene
-    carried: FloatArray  # (V, b, 2) px where its object has it now; as taught without one
+    places: tuple[Place, ...]  # of the scene, then of objects that were looked at
     s: FloatArray  # (V, b, 2) px at the pose to drive to: of incidences the one that was chosen
     incidences: tuple[Incidence, ...] = ()  # by positions in the body; none for the whole pose
 
     @classmethod
-    def at(cls, s: FloatArray, incidences: tuple[Incidence, ...] = ()) -> "Goal":
-        """Return the goal that images (V, b, 2) show, and nothing carries."""
-        return cls(s, s, s, incidences)
+    def at(cls, s: FloatArray) -> "Goal":
+        """Return the whole pose that images (V, b, 2) show, and nothing carries."""
+        return cls((Place(s),), s)
 
     @property
-    def partly_carried(self) -> bool:
-        """Whether an object carries some of the incidences, and others stand still."""
-        return len({one.carried for one in self.incidences}) > 1
+    def carriers(self) -> tuple[int, ...]:
+        """Places of the carriers of its incidences, each once; of a whole pose the last one."""
+        return tuple(sorted({one.carrier for one in self.incidences})) or (len(self.places) - 1,)
 
-    def carried_to(self, s: FloatArray) -> "Goal":
-        """Return the goal with its object where it is now; all of it goes along, unless some stands still."""
-        return self._replace(carried=s, s=self.s if self.partly_carried else s)
+    def place(self, carrier: int) -> Place:
+        """Place of a carrier; of an object that was not looked at where the goal was taught."""
+        return self.places[carrier if carrier < len(self.places) else 0]
+
+    def carried_to(self, objects: Sequence[Place]) -> "Goal":
+        """Return the goal with its objects where they are now; all of it goes along, unless that tears it."""
+        found = self._replace(places=(self.places[0], *objects))
+        return found if len(found.carriers) > 1 else found._replace(s=found.place(*found.carriers).s)
+
+    def to(self, s: FloatArray) -> "Goal":
+        """Return the goal where images (V, b, 2) show it, whatever carries it."""
+        return self._replace(places=tuple(place._replace(s=s) for place in self.places), s=s)
 
 
 class TaskImages(NamedTuple):
@@ -104,7 +118,7 @@ class TaskImages(NamedTuple):
 
     def to(self, s: FloatArray) -> "TaskImages":
         """Return the task to where images (V, b, 2) show the goal."""
-        return self._replace(goal=Goal.at(s, self.goal.incidences))
+        return self._replace(goal=self.goal.to(s))
 
     def asking(self, incidences: tuple[Incidence, ...]) -> "TaskImages":
         """Return the task with other incidences; without any for the whole pose."""
@@ -143,12 +157,20 @@ class TaskImages(NamedTuple):
 
         H_star : (4, 4) displacement at the pose to drive to, if it is known.
         """
-        goal, found = self.goal, dict[bool, FloatArray]()
-        for carried in {one.carried for one in goal.incidences}:
-            s = goal.carried if carried else goal.taught
+        goal, found = self.goal, dict[int, FloatArray]()
+        for carrier in goal.carriers:
+            s = goal.place(carrier).s
             known = H_star if s is goal.s else None
-            found[carried] = self.to(s).displacement_at_goal(model) if known is None else known
-        return np.array([found[one.carried] for one in goal.incidences])
+            found[carrier] = self.to(s).displacement_at_goal(model) if known is None else known
+        return np.array([found[one.carrier] for one in goal.incidences])
+
+    def scenes(self, H_taught: FloatArray) -> list[FloatArray]:
+        """Points (…, 4) that span the feature of the scene of each incidence, by displacements (g, 4, 4)."""
+        goal = self.goal
+        return [
+            points_of(np.concatenate([self.body.M, goal.place(one.carrier).M]), one.scene) @ H.T
+            for one, H in zip(goal.incidences, H_taught, strict=True)
+        ]
 
     def displacement_at_start(self, model: Model) -> FloatArray:
         """Displacement (4, 4) of the body at the start; raises WorkFailed where images do not show it."""
@@ -181,7 +203,8 @@ class TaskImages(NamedTuple):
 
     def _rows(self, model: Model, task: Task, H_star: FloatArray) -> Incidences:
         """Rows of the incidences by a task to the goal (4, 4)."""
-        rows = incidences_of(model, task.body, self.displacements_taught(model, H_star), self.goal.incidences)
+        scenes = self.scenes(self.displacements_taught(model, H_star))
+        rows = incidences_of(model, task.body, scenes, self.goal.incidences)
         A = np.ascontiguousarray(task.body.M[: len(task.A_star)])
         face = np.array(face_plane(A, task.order, center_of(A, task.center)))
         shows = task.body.in_goal

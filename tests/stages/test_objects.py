@@ -66,7 +66,7 @@ def test_a_goal_is_carried_along_to_where_it_should_be_as_well_as_is_stated():
         ):
             seen = drawn[label][np.isfinite(drawn[label][:, 0])]
             assert {*map(tuple, seen)} == {*map(tuple, s[view])}
-    still = replace(planned, carried=None)
+    still = replace(planned, carried=())
     assert "no object" in figure.lacking(Driven(calibration, None, still, {}))
 
 
@@ -126,6 +126,83 @@ def test_a_part_and_the_scene_are_in_one_goal():
             config.replace({"task.goal.displaced": {"along": "pin", "by_m": 0.05}}),
             calibration,
         )
+
+
+# Four markers about the plane of the table beside it, that have moved by themselves.
+BESIDE = np.array([0.5, 0.25, 0.42]) + 0.05 * np.random.default_rng(2).standard_normal((5, 3))
+BOX = {
+    "markers": [*range(50, 55)],
+    "positions_m": BESIDE.tolist(),
+    "displacement": {"translation_m": [0.0, -0.02, 0.015], "rotation_deg": [-3.0, 2.0, 5.0]},
+}
+SIDE = {"side": {"on": "tool", "plane": [0, 1, 10]}}
+
+
+def insertion(objects, features, incidences, *more):
+    """The pin, the tip and features of objects."""
+    settings = [
+        *(f"objects.{name}={json.dumps(one)}" for name, one in objects.items()),
+        *(f"features.{name}={json.dumps(one)}" for name, one in features.items()),
+        f"task.goal.incidences={incidences}",
+    ]
+    return configured("insertion", *settings, *more)
+
+
+def test_two_objects_are_in_one_goal():
+    """The pin in the hole of a part, its tip on the plane of a box: each where its object has it now."""
+    features = SIDE | {"hole": {"on": "block", "line": "pin"}, "top": {"on": "box", "plane": "side"}}
+    config = insertion({"block": BLOCK, "box": BOX}, features, "[[pin, hole], [tip, top]]")
+    calibration = calibrate.run(config)[1]
+    planned, truth = plan.run(config, calibration), truth_of(config)
+    assert [one.object_name for one in planned.carried] == ["block", "box"]
+    assert planned.object_name == "block"
+    taught = truth.displacement(config.task.goal.joints.values(config.joint_types))
+    moved = {name: one.moved for name, one in config.objects.named.items()}
+    pin, side = truth.of((10, 11)), truth.of((0, 1, 10))
+    hole, plane = (pin @ (moved["block"] @ taught).T)[:, :3], (side @ (moved["box"] @ taught).T)[:, :3]
+    along, normal = hole[1] - hole[0], np.cross(plane[1] - plane[0], plane[2] - plane[0])
+    for law in ("exact_track", "incidences"):
+        trace = servo.run(config, calibration, planned, law)
+        assert (trace.verdict, trace.success, trace.free_dof) == ("converged", True, 1), trace.reason
+        ends = (pin @ (trace.pose[-1] @ np.linalg.inv(truth.robot.base_tool)).T)[:, :3]
+        beside = np.linalg.norm(np.cross(ends - hole[0], along), axis=1).max() / np.linalg.norm(along)
+        above = abs((ends[1] - plane[0]) @ normal) / np.linalg.norm(normal)
+        assert (1e3 * np.array([beside, above]) < 2.0 * trace.incidence_mm).all()
+    for one, deviation in zip(planned.carried, trace.incidence_deviation_mm, strict=True):
+        assert one.goal_deviation_mm < deviation < 2.0 * one.goal_deviation_mm
+    shown = Driven(calibration, None, planned, {"incidences": trace})
+    figure = REGISTER["fig22_object"].drawn(REGISTER["fig22_object"].data(shown))
+    assert len(figure.axes) == 2 * len(trace.view)
+
+
+def test_markers_of_an_object_are_features():
+    """The tip on the middle of markers of a part, the pin along two of them, which nobody has taught."""
+    objects = {"block": BLOCK}
+    features = {
+        "spot": {"on": "block", "point": [40, 41, 42, 43]},
+        "edge": {"on": "block", "line": [44, 45]},
+    }
+    config = insertion(objects, features, "[[tip, spot], [pin, edge, parallel]]")
+    calibration = calibrate.run(config)[1]
+    planned, truth = plan.run(config, calibration), truth_of(config)
+    X = (config.objects.named["block"].points @ config.objects.named["block"].moved.T)[:, :3]
+    spot, edge = X[:4].mean(axis=0), X[5] - X[4]
+    trace = servo.run(config, calibration, planned, "exact_track")
+    assert (trace.verdict, trace.success) == ("converged", True), trace.reason
+    ends = (truth.of((10, 11)) @ (trace.pose[-1] @ np.linalg.inv(truth.robot.base_tool)).T)[:, :3]
+    off_mm = 1e3 * np.linalg.norm(ends[1] - spot)
+    pin = ends[1] - ends[0]
+    off_deg = np.degrees(np.arccos(pin @ edge / np.linalg.norm(pin) / np.linalg.norm(edge)))
+    assert off_mm < 2.0 * trace.incidence_mm[0] < planned.goal_deviation_mm
+    assert off_deg < 2.0 * trace.incidence_deg[1] < 4.0
+
+
+def test_features_of_markers_that_an_object_does_not_have_are_refused():
+    features = {"spot": {"on": "block", "point": [10]}}
+    with pytest.raises(InputError, match=r"features\.spot\.point: marker 10 is not of block: name some"):
+        insertion({"block": BLOCK}, features, "[[tip, spot]]")
+    with pytest.raises(InputError, match="is the name of a feature of the tool that was there"):
+        insertion({"block": BLOCK}, {"spot": {"on": "scene", "point": [40]}}, "[[tip, spot]]")
 
 
 REFUSED = [

@@ -8,6 +8,7 @@ import pytest
 
 from projservo_cli.records import (
     Calibration,
+    CarriedByObject,
     GoalOfIncidences,
     InputError,
     Observation,
@@ -33,7 +34,7 @@ def test_names_of_parts_are_names_of_the_record_and_of_no_other_part(kind):
 
 def test_what_an_absent_part_has_is_none_or_its_default():
     plan = fake(Plan)
-    assert (plan.carried, plan.object_name, plan.s_carried, plan.incidences) == (None, None, None, ())
+    assert (plan.carried, plan.object_name, plan.s_carried, plan.incidences) == ((), None, None, ())
 
 
 @pytest.mark.parametrize(
@@ -82,4 +83,18 @@ def test_a_part_comes_back_from_a_file_where_it_was(tmp_path):
     )
     back = load(tmp_path).plan
     assert (back.open_goal.incidences, back.free_dof) == (("pin on hole",), 3)
-    assert (back.search, back.carried) == (None, None)
+    assert (back.search, back.carried) == (None, ())
+
+
+def test_parts_of_a_list_come_back_from_a_file_each_of_its_own_size(tmp_path):
+    objects = tuple(
+        fake(CarriedByObject, k, {"object_marker": 4 + k}, object_name=name)
+        for k, name in enumerate(("block", "box", "lid"))
+    )
+    plan = changed(fake(Plan), carried=objects)
+    assert (plan.object_name, changed(plan, object_name="other").carried[0].object_name) == ("block", "other")
+    save(Run(tmp_path / "run.h5", "", {"plan": Result("", "", {}, {}, {"": plan})}))
+    back = load(tmp_path).plan
+    assert [one.object_name for one in back.carried] == ["block", "box", "lid"]
+    for one, other in zip(back.carried, objects, strict=True):
+        np.testing.assert_array_equal(one.s_object, other.s_object)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from projservo_cli.geometry.displacements import generators
 from projservo_cli.metric.frame import changes_of
 from projservo_cli.monitoring.accuracy import metres_by
 from projservo_cli.records import ANGLE, MEET, PARALLEL, PERPENDICULAR
@@ -124,9 +125,46 @@ def test_changes_are_those_of_poses_fitted_again_with_a_calibration_that_is_off(
         ]
         again.append(np.concatenate([fit.T for fit in fits]))
     for one in ASKED:
-        shared = changes_of(whole.vectors(one, whole.M, np.array(again), whole.unit_mm)).T
+        shared = changes_of(whole.vectors(one, whole.unit_mm, M=whole.M, T=np.array(again))).T
         c = shared.shape[1]
         assert whole.changes(one)[:, :c] == pytest.approx(shared, abs=1e-3 * np.abs(shared).max())
+
+
+def test_points_of_an_object_change_as_those_fitted_again_do(placed):
+    """By a calibration that is off, and by each pixel; then distances to them, in closed form."""
+    calibration, markers, ends, lengths, *_ = placed
+    rig, rng = metric_rig(calibration), np.random.default_rng(6)
+    middle, size = rig.M[0, :, :3].mean(axis=0), np.ptp(rig.M[0, :, :3], axis=0).max()
+    X = np.c_[middle + 0.5 * size * rng.normal(size=(5, 3)), np.ones(5)]
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_rotvec(0.2 * rng.normal(size=3)).as_matrix()
+    T[:3, 3] = middle - T[:3, :3] @ middle + 0.1 * size * rng.normal(size=3)
+    looks = [Look(rig.pixels(X @ at.T)[0], np.full((len(rig.P[0]), 5), 0.3)) for at in (np.eye(4), T)]
+    E = generators(rig.linear, X[:, :3].mean(axis=0))
+
+    def fitted(rig, s):
+        given = [look._replace(s=shown) for look, shown in zip(looks, s, strict=True)]
+        return BundleFit.settled(rig.bundle(given, E, 0), X, np.array([np.eye(4), T]))
+
+    s = np.array([look.s for look in looks])
+    found = fitted(rig, s).points_at(1, rig)
+    each = [
+        fitted(rig._replace(P=P[None], lens=lens[None]), s) for P, lens in zip(rig.P, rig.lens, strict=True)
+    ]
+    shared = np.moveaxis(changes_of(np.array([one.X @ one.T[1].T for one in each]))[..., :3], 0, -1)
+    assert found.by_calibration == pytest.approx(shared, abs=1e-3 * np.abs(shared).max())
+    for n in (0, 7, 22, 39):
+        moved = s.ravel().copy()
+        moved[n] += 3e-3
+        there = fitted(rig, moved.reshape(s.shape))
+        by = ((there.X @ there.T[1].T) - found.X)[:, :3] / 1e-2  # of a deviation of 0.3 px
+        assert found.by_images[..., n] == pytest.approx(by, abs=2e-3 * np.abs(by).max())
+    asked = [Incidence("tip", POINT, ((len(markers) + 1,), (len(markers) + 3,)))]
+    (mm,), *_ = incidence_errors(calibration, markers, asked, ends._replace(of_object=found), lengths)
+    unit = 1e3 * metres_by(rig.M[:, markers, :3], lengths)
+    tip = placed_by(rig, markers, ends, unit).features(Incidence("tip", POINT, POINT))[0][0]
+    a, b = found.X[[1, 3], :3]
+    assert mm == pytest.approx(unit[0] * np.linalg.norm(np.cross(tip - a, b - a)) / np.linalg.norm(b - a))
 
 
 def test_vectors_turn_with_the_frame_and_their_lengths_do_not():

@@ -32,6 +32,7 @@ from projservo_cli.task.incidences import (
     incidences_of,
     linearized,
     nearest_goal,
+    points_of,
     weighted,
     whole_pose,
 )
@@ -80,6 +81,11 @@ def random_arm(generator):
     return model._replace(H_hat_0=np.array(moved)), np.concatenate([face(), pins])
 
 
+def scenes(body, H, asked):
+    """Points that span features of the scene, by incidences that were taught at H (4, 4)."""
+    return [points_of(body.M, one.scene) @ H.T for one in asked]
+
+
 class Case:
     """A list of incidences on a body, in the frame G, taught at joints ``q_star``, or displaced (4, 4)."""
 
@@ -88,7 +94,7 @@ class Case:
         self.model, self.M = in_frame(model, G), M @ G.T
         self.body = make_body(self.model, self.M)
         self.H = poe(self.model, q_star) if q_star.ndim == 1 else q_star
-        rows = incidences_of(self.model, self.body, self.H, asked)
+        rows = incidences_of(self.model, self.body, scenes(self.body, self.H, asked), asked)
         shows = np.ones((2, len(M)), dtype=bool)
         a = face_of(self.body.M[:4])
         goal = nearest_goal(rows, self.body, self.H, image_velocities(self.model, shows))
@@ -239,7 +245,8 @@ def contradicting(asked, seed, sigma_px, G=None):
     there = in_frame(model, G)
     H = poe(there, model.q_reference + deviating(rng))
     shows = np.ones((2, len(M)), dtype=bool)
-    return list(contradictions(there, make_body(there, M @ G.T), H, asked(M), shows, sigma_px))
+    body, pairs = make_body(there, M @ G.T), asked(M)
+    return list(contradictions(there, body, H, scenes(body, H, pairs), pairs, shows, sigma_px))
 
 
 def apart(asked, seed=0, sigma_px=0.1, G=None):
@@ -322,22 +329,32 @@ def test_angles_need_axes_that_are_not_parallel():
     model, M = random_arm(np.random.default_rng(2))
     slides = model._replace(H_hat_0=np.array([*map(prismatic, np.eye(3))]), prismatic=np.ones(3, bool))
     asked = [Incidence("pin upright", LINE, WALL, PERPENDICULAR)]
+    body = make_body(model, M)
     with pytest.raises(InputError, match="pin upright needs the metric form"):
-        incidences_of(slides, make_body(model, M), np.eye(4), asked)
+        incidences_of(slides, body, scenes(body, np.eye(4), asked), asked)
 
 
 @pytest.mark.parametrize(("flat", "kind"), [(((4,), (4,)), "line"), (((4,), (5,), (4, 5)), "plane")])
 def test_points_that_span_no_line_or_plane_are_refused(flat, kind):
     model, M = random_arm(np.random.default_rng(2))
     for tool, scene in ((flat, PLANE), (PLANE, flat)):
+        body, asked = make_body(model, M), [Incidence("pin", tool, scene)]
         with pytest.raises(WorkFailed, match=f"incidence pin: its points span no {kind}: name others"):
-            incidences_of(model, make_body(model, M), np.eye(4), [Incidence("pin", tool, scene)])
+            incidences_of(model, body, scenes(body, np.eye(4), asked), asked)
+
+
+def test_a_feature_of_markers_that_nothing_has_shown_is_refused():
+    model, M = random_arm(np.random.default_rng(2))
+    asked = [Incidence("pin", POINT, POINT)]
+    with pytest.raises(WorkFailed, match="incidence pin: fewer than two cameras see all markers"):
+        incidences_of(model, make_body(model, M), [np.full((1, 4), np.nan)], asked)
 
 
 def test_a_goal_whose_images_show_too_little_is_refused():
     model, M = random_arm(np.random.default_rng(2))
     body = make_body(model, M)
-    rows = incidences_of(model, body, np.eye(4), [Incidence("pin", LINE, LINE)])
+    asked = [Incidence("pin", LINE, LINE)]
+    rows = incidences_of(model, body, scenes(body, np.eye(4), asked), asked)
     shows = np.zeros((2, len(M)), dtype=bool)
     shows[:, 0] = True
     with pytest.raises(WorkFailed, match="do not determine the pose of the body: show more markers"):

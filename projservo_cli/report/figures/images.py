@@ -537,24 +537,27 @@ _CARRIED = style.line(style.GREEN, width=1.6, label="face at the carried goal")
 
 
 def _data_object(report_data: ReportData | Driven) -> Data:
-    """Images of the object of the goal when it was taught and now, and of the face at the carried goal."""
+    """Images of the objects of the goal when it was taught and now, and of the face at the carried goals."""
     plan, order = report_data.plan, cyclic_order(report_data.plan.A)
-    carried = plan.carried
-    assert carried is not None
-    assert carried.s_object_taught is not None
-    return {
-        "about": np.array(carried.object_words),
+    data: Data = {
+        "about": np.array([one.object_words for one in plan.carried]),
         "view": np.array(plan.view),
-        "marker": carried.object_marker,
-        "taught": carried.s_object_taught,
-        "now": carried.s_object,
-        "face": carried.s_carried[:, order],
+        "object": np.array([one.object_name for one in plan.carried]),
     }
+    for one in plan.carried:
+        assert one.s_object_taught is not None
+        data |= {
+            f"marker_{one.object_name}": one.object_marker,
+            f"taught_{one.object_name}": one.s_object_taught,
+            f"now_{one.object_name}": one.s_object,
+            f"face_{one.object_name}": one.s_carried[:, order],
+        }
+    return data
 
 
 def _carried(report_data: Driven | ReportData) -> bool:
     carried = report_data.plan.carried
-    return carried is not None and carried.s_object_taught is not None
+    return bool(carried) and all(one.s_object_taught is not None for one in carried)
 
 
 @registered(
@@ -562,22 +565,25 @@ def _carried(report_data: Driven | ReportData) -> bool:
     "The object of the goal, and the goal carried along",
     "no figure",
     _data_object,
-    height=4.2,
     shows=(_carried, "no object carries the goal"),
     alt="For each camera: the tags of the object when the goal was taught and now, the displacement of each "
     "marker, and the face at the goal that was carried along.",
 )
 def _draw_object(data: Data, figure: "style.Figure") -> None:
-    """A panel for each camera."""
-    names, tags = data["view"], data["marker"] // CORNERS
-    (row,) = panels.rows(figure, [len(names)])
-    for panel, taught, now, face in zip(row, data["taught"], data["now"], data["face"], strict=True):
-        moved = np.stack([taught, now], axis=1)
-        panel.plot(*style.outlines(moved[np.isfinite(moved).all(axis=(1, 2))]).T, **_MOVED)
-        for shown, line in ((taught, _TAUGHT), (now, _NOW)):
-            each = [style.outlines(shown[None, tags == tag]) for tag in dict.fromkeys(tags.tolist())]
-            panel.plot(*np.concatenate(each).T, **line)
-        style.face(panel, face, _CARRIED)
-    panels.cameras(row, names)
-    figure.suptitle(textwrap.fill(str(data["about"]), 90))
+    """A row for each object, with a panel for each camera."""
+    names = data["view"]
+    rows = panels.rows(figure, [len(names)] * len(data["object"]))
+    for row, name in zip(rows, data["object"].tolist(), strict=True):
+        tags = data[f"marker_{name}"] // CORNERS
+        images = (data[f"{key}_{name}"] for key in ("taught", "now", "face"))
+        for panel, taught, now, face in zip(row, *images, strict=True):
+            moved = np.stack([taught, now], axis=1)
+            panel.plot(*style.outlines(moved[np.isfinite(moved).all(axis=(1, 2))]).T, **_MOVED)
+            for shown, line in ((taught, _TAUGHT), (now, _NOW)):
+                each = [style.outlines(shown[None, tags == tag]) for tag in dict.fromkeys(tags.tolist())]
+                panel.plot(*np.concatenate(each).T, **line)
+            style.face(panel, face, _CARRIED)
+        panels.cameras(row, names)
+    figure.set_figheight(3.8 * len(rows) + 0.4)
+    figure.suptitle("\n".join(textwrap.fill(str(about), 90) for about in data["about"]))
     style.legend_below(figure, 2)

@@ -47,7 +47,7 @@ from projservo_cli.stages.worlds.calibrated import CalibratedWorld, TruePoses
 from projservo_cli.stages.worlds.task_images import positioned, task_images
 from projservo_cli.task.body import make_body
 from projservo_cli.task.face import center_of
-from projservo_cli.task.incidences import incidences_of, nearest_goal
+from projservo_cli.task.incidences import incidences_of, nearest_goal, points_of
 from projservo_cli.task.look_bundle import Look
 from projservo_cli.task.stand_off import displacement_back
 from projservo_cli.task.target import TaskImages
@@ -86,16 +86,15 @@ class SimulatedWorld(CalibratedWorld):
         if q_goal is None:
             return Ends(truth.robot.base_tool, np.full((4, 4), np.nan), np.full(4, np.nan))
         found = truth.ends(q_goal)
-        if not images.goal.partly_carried:
-            T = self._carried
+        if len(carriers := images.goal.carriers) == 1:
+            T = self._carried(carriers[0] if images.goal.incidences else len(self.inputs.carriers))
             found = found._replace(goal_pose=T @ found.goal_pose, goal=T @ found.goal)
         return self._displaced(images, found)
 
-    @property
-    def _carried(self) -> FloatArray:
-        """Displacement (4, 4) of the object of the goal since it was taught; of none without one."""
-        carrier = self.inputs.carrier
-        return np.eye(4) if carrier is None or carrier.placed is None else carrier.placed.T
+    def _carried(self, carrier: int) -> FloatArray:
+        """Displacement (4, 4) of a carrier since the goal was taught; of the scene none."""
+        placed = self.inputs.carriers[carrier - 1].placed if carrier else None
+        return np.eye(4) if placed is None else placed.T
 
     def _displaced(self, images: TaskImages, ends: Ends) -> Ends:
         """Return the true ends of a task with its goal displaced, if that is asked for."""
@@ -116,10 +115,15 @@ class SimulatedWorld(CalibratedWorld):
         truth, on_tool = self.truth, plant.model.on_tool
         H_taught = ends.goal_pose @ np.linalg.inv(ends.base_tool)
         body = make_body(truth.model, truth.of(self.numbers))
-        at = np.linalg.inv(H_taught) if on_tool else H_taught
-        if images.goal.partly_carried:
-            at = np.array([self._carried @ at if one.carried else at for one in images.goal.incidences])
-        rows = incidences_of(truth.model, body, at, images.goal.incidences)
+        at, carriers = np.linalg.inv(H_taught) if on_tool else H_taught, images.goal.carriers
+        scenes = list[FloatArray]()
+        for one in images.goal.incidences:
+            T, M = self._carried(one.carrier), body.M
+            there = M @ (T @ at if len(carriers) > 1 else at).T
+            if one.carrier and (placed := self.inputs.carriers[one.carrier - 1].placed) is not None:
+                there = np.concatenate([there, placed.X @ T.T])
+            scenes.append(points_of(there, one.scene))
+        rows = incidences_of(truth.model, body, scenes, images.goal.incidences)
         H = nearest_goal(rows, body, H, _point_velocities)
         pose = (np.linalg.inv(H) if on_tool else H) @ ends.base_tool
         return Ends(ends.base_tool, pose, H @ np.array(center_of(plant.M, plant.center)))
@@ -248,11 +252,11 @@ class RenderedWorld(SimulatedWorld):
         The body is fitted to both by the deviations of their pixels, whichever is the larger. Markers of the
         face that frames do not show are predicted from those that they show.
         """
-        given, carrier = self.goal_images, self.inputs.carrier
+        given, carriers = self.goal_images, self.inputs.carriers
         start, sigma = self._frames(self.scene, images.q_start, (seed, START_FRAMES))
         if given is None:
             assert q_taught is not None
-            at_first = None if carrier is None else carrier.at_first
+            at_first = carriers[0].at_first if carriers else None
             goal, there = self._frames(at_first or self.scene, q_taught, (seed, GOAL_FRAMES))
         else:
             deviations = given.deviations(self.numbers, self.inputs.face, self.view)
