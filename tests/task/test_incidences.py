@@ -220,6 +220,7 @@ def test_the_sense_of_parallel_planes_does_not_depend_on_where_they_are(seed):
         assert image_error_at(case.rows, apart @ G @ half @ np.linalg.inv(G)) > 50.0
 
 
+@pytest.mark.volume
 @pytest.mark.parametrize("kind", [(LINE, LINE, MEET), (PLANE, PLANE, MEET), (LINE, LINE, PARALLEL)])
 def test_the_nearest_goal_has_its_features_in_their_sense(kind):
     """From wherever the body is turned to, and in any frame; the errors of the other sense are told."""
@@ -264,6 +265,7 @@ CONTRADICTORY = [
 ]
 
 
+@pytest.mark.volume
 @pytest.mark.parametrize("pair", CONTRADICTORY)
 def test_incidences_that_no_place_meets_are_named(pair):
     """The two of them, alone and among others that they agree with, in any frame."""
@@ -291,6 +293,7 @@ def _angle(X, Y, tool, scene):
     return math.degrees(math.acos(np.clip(cosine, -1.0, 1.0)))
 
 
+@pytest.mark.volume
 def test_angles_that_some_turn_has_together_agree():
     """Of up to three pairs of lines or of planes, as a random turn of the tool makes them."""
     for seed in range(40):
