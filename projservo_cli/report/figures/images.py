@@ -583,7 +583,7 @@ def _draw_object(data: Data, figure: "style.Figure") -> None:
                 each = [style.outlines(shown[None, tags == tag]) for tag in dict.fromkeys(tags.tolist())]
                 panel.plot(*np.concatenate(each).T, **line)
             style.face(panel, face, _CARRIED)
-        panels.cameras(row, names)
+        panels.cameras(row, names, name if len(rows) > 1 else "")
     figure.set_figheight(3.8 * len(rows) + 0.4)
     figure.suptitle("\n".join(textwrap.fill(str(about), 90) for about in data["about"]))
     style.legend_below(figure, 2)
