@@ -19,7 +19,7 @@ from projservo_cli.detection import Board
 from projservo_cli.display import About
 from projservo_cli.records import ANGLE, CORNERS, MEET, PARALLEL, PERPENDICULAR, TOOL, InputError
 from projservo_cli.result_hashes import File
-from projservo_cli.robots.settings import Following, JointSettings, SpeedLimits
+from projservo_cli.settings.control import ServoLimits, SpeedLimits
 from projservo_cli.settings.disturbance import Disturbance, Events, Faults
 from projservo_cli.settings.features import Feature, Pair
 from projservo_cli.settings.objects import ObjectSettings
@@ -40,6 +40,8 @@ from projservo_cli.stages.stage_inputs import (
     Contract,
     Drive,
     Estimation,
+    Following,
+    JointSettings,
     KnownLengths,
     Motions,
     OwnRobot,
@@ -61,8 +63,6 @@ from projservo_cli.task.stand_off import StandOff
 
 _RANDOM_POSES = 12  # of trials where joints may be read or images taken with faults
 _TICKS = 4096  # in a turn of an encoder that is as coarse as any
-# Accelerations that the profile joint_space takes where no limit is given, deg/s² and m/s².
-_ACCELERATION_DEG_S2, _ACCELERATION_M_S2 = 500.0, 2.0
 _EXPECTED = {
     "table": "a table, which projservo record calibrate makes",
     "readings": "a table of joints: pose, q1 ... qN",
@@ -470,24 +470,15 @@ def scene_of(
 
 def joints_of(config: Config, *, paced: bool = True) -> JointSettings:
     """Joints as far as they are configured; ``paced`` with their speeds."""
-    robot, vector, c = config.robot, config.reference, config.control
-    limits = robot.limits if robot is not None else None
-    ranges = robot.ranges if robot is not None and limits is None else None
-    turning = c.joint_acceleration_limit_deg_s2 or _ACCELERATION_DEG_S2
-    speeds = SpeedLimits(
-        math.inf if c.joint_speed_limit_deg_s is None else math.radians(c.joint_speed_limit_deg_s),
-        math.inf if c.prismatic_speed_limit_m_s is None else c.prismatic_speed_limit_m_s,
-        math.radians(turning),
-        c.prismatic_acceleration_limit_m_s2 or _ACCELERATION_M_S2,
-    )
+    arm, vector = config.arm, config.reference
+    limits = config.robot.limits if config.robot is not None else None
     return JointSettings(
         types=config.joint_types or "",
-        ranges=ranges if limits is None else limits.joints,
-        in_degrees=limits is not None and limits.unit == "deg",
-        widened=None if limits is None else limits.from_data,
+        ranges=None if arm is None else arm.ranges,
+        limits=limits,
         unit=(limits.unit if limits is not None else None) or ("rad" if vector is None else vector.unit),
         known=0 if vector is None else len(vector.joints),
-        speeds=speeds if paced else SpeedLimits(),
+        speeds=config.control.speed_limits if paced else SpeedLimits(),
     )
 
 
@@ -509,13 +500,8 @@ def _drive(
     if truth is not None:
         faults, scene = config.disturbance.part(Faults), scene_of(config, files, objects if shows else None)
         robot = SimulatedRobot(truth, faults, scene, period, objects_of(config) if shows else ())
-    following = Following(
-        period,
-        plant.speed_scale if speed_scale is None else speed_scale,
-        plant.max_servo_lag_s,
-        plant.max_steady_state_error_deg,
-        plant.max_relative_target_deg,
-    )
+    scale = plant.speed_scale if speed_scale is None else speed_scale
+    following = Following(period, scale, plant.part(ServoLimits))
     endless, seen = plant.simulated and plant.joint_limits == "report", truth is None or shows
     return Drive(robot or _own(config), following, endless, further if seen else ())
 

@@ -1,8 +1,9 @@
 """Control laws, the robot to drive, and when a run of it ends."""
 
 import json
+import math
 from collections.abc import Iterator
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import AfterValidator, BeforeValidator, Field, StrictInt, WithJsonSchema
 from pydantic_core import PydanticCustomError
@@ -65,6 +66,19 @@ _Mode = Literal["regulate", "track", "image_track"]
 _Modes = Annotated[tuple[_Mode, ...], Field(min_length=1)]
 
 
+# Accelerations that the profile joint_space takes where no limit is given, deg/s² and m/s².
+_ACCELERATION_DEG_S2, _ACCELERATION_M_S2 = 500.0, 2.0
+
+
+class SpeedLimits(NamedTuple):
+    """Speed and acceleration limits of joints: per s and per s², rad (revolute) and m (prismatic)."""
+
+    revolute: float = math.inf
+    prismatic: float = math.inf
+    turning: float = math.inf  # acceleration
+    sliding: float = math.inf
+
+
 class Control(Section):
     """Control laws, their modes and gains, and the speed limits of the joints."""
 
@@ -123,6 +137,17 @@ class Control(Section):
         "visible markers; null: body if the calibration is usable",
     )
 
+    @property
+    def speed_limits(self) -> SpeedLimits:
+        """Limits of the joints, infinite where no speed is given."""
+        turn, slide = self.joint_speed_limit_deg_s, self.prismatic_speed_limit_m_s
+        return SpeedLimits(
+            math.inf if turn is None else math.radians(turn),
+            math.inf if slide is None else slide,
+            math.radians(self.joint_acceleration_limit_deg_s2 or _ACCELERATION_DEG_S2),
+            self.prismatic_acceleration_limit_m_s2 or _ACCELERATION_M_S2,
+        )
+
     def contradictions(self) -> Iterator[Note]:
         """Gains that overshoot."""
         for name in ("gain_t", "gain_r", "gain_p", "gain_s", "gain"):
@@ -154,12 +179,8 @@ class RenderedOptions(Section):
     )
 
 
-class PlantSettings(Section):
-    """The robot to drive, and the behaviour of a simulated one at its limits.
-
-    ``use`` names the class of an external robot and ``options`` its arguments. The loop never commands an
-    external robot beyond its joint limits.
-    """
+class RobotClass(Section):
+    """The class of the robot to drive, and how long it may take."""
 
     use: _PlantClass | None = Field(
         None,
@@ -169,6 +190,21 @@ class PlantSettings(Section):
     options: dict[str, Plain] = Field({}, description="keyword arguments of the class")
     timeout_s: Positive = Field(1.0, description="maximum time of one answer of the robot")
     open_s: Positive = Field(30.0, description="maximum time to open the robot")
+
+    @property
+    def simulated(self) -> bool:
+        """Whether the robot is a simulated one, whose truth is known."""
+        return self.use in (None, RENDERED)
+
+    @property
+    def rendered(self) -> RenderedOptions | None:
+        """Options of the plant mujoco; None where another one is driven."""
+        return RenderedOptions.model_validate(self.options) if self.use == RENDERED else None
+
+
+class ServoLimits(Section):
+    """Limits of the servos of a robot, beyond which it does not follow."""
+
     max_relative_target_deg: Positive | None = Field(
         None,
         description="maximum distance of a set-point from the reading; null: from max_servo_lag_s, "
@@ -180,6 +216,15 @@ class PlantSettings(Section):
         description="maximum distance of a joint at rest from its set-point; prismatic joints: 5.24 mm "
         "per degree",
     )
+
+
+class PlantSettings(ServoLimits, RobotClass):
+    """The robot to drive, and the behaviour of a simulated one at its limits.
+
+    ``use`` names the class of an external robot and ``options`` its arguments. The loop never commands an
+    external robot beyond its joint limits.
+    """
+
     time_offset_s: Delays | None = Field(
         None,
         description="time from the middle of an exposure to the joint readings that arrive with its "
@@ -202,16 +247,6 @@ class PlantSettings(Section):
     image_border: Literal["report", "stop"] = Field(
         "report", description="a marker outside an image is reported, or stops the run"
     )
-
-    @property
-    def simulated(self) -> bool:
-        """Whether the robot is a simulated one, whose truth is known."""
-        return self.use in (None, RENDERED)
-
-    @property
-    def rendered(self) -> RenderedOptions | None:
-        """Options of the plant mujoco; None where another one is driven."""
-        return RenderedOptions.model_validate(self.options) if self.use == RENDERED else None
 
 
 class Stop(Section):

@@ -133,7 +133,7 @@ class _Screws(Section):
             yield ("base_tool",), what
 
 
-class _Limits(Section):
+class LimitSettings(Section):
     """Joint limits of a robot without kinematics in the configuration."""
 
     joints: Annotated[tuple[Vector2, ...], Field(min_length=1, max_length=64)] | None = Field(
@@ -180,7 +180,7 @@ class RobotSettings(Section):
     )
     urdf: _File | None = Field(None, description="path of a URDF, of which only the screws are read")
     tip: str | None = Field(None, description="body or site of mjcf, or link of urdf, that carries the tool")
-    limits: _Limits | None = Field(None, description="joint limits of a robot without dh and screws")
+    limits: LimitSettings | None = Field(None, description="joint limits of a robot without dh and screws")
 
     @property
     def joints(self) -> tuple[_Joint, ...]:

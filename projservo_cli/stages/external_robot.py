@@ -12,9 +12,9 @@ from projservo_cli.hardware.camera_robot import Arm, CameraRobot
 from projservo_cli.passwords import MASK
 from projservo_cli.records import FloatArray, InputError, WorkFailed
 from projservo_cli.robots.contract import Bounds, PluginRobot, Reading, Robot
+from projservo_cli.robots.joints import Joints
 from projservo_cli.robots.pacing import Steered
 from projservo_cli.robots.session import Session
-from projservo_cli.robots.settings import Joints
 from projservo_cli.robots.standstill import STILL, Standstill, at_rest
 from projservo_cli.simulation.faults import FaultyRobot, obstruction_of
 from projservo_cli.stages.stage_inputs import Drive, OwnRobot

@@ -1,5 +1,6 @@
 """Inputs of each stage: records of the values that it reads, of which its key is a hash."""
 
+import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -9,13 +10,15 @@ from projservo_cli.control.law import Gains
 from projservo_cli.detection import Board
 from projservo_cli.display import About
 from projservo_cli.image_size import ImageSize
-from projservo_cli.records import TOOL, FloatArray
+from projservo_cli.records import TOOL, Calibration, FloatArray, InputError, JointLimits
 from projservo_cli.result_hashes import File, digest, encoded
-from projservo_cli.robots.settings import Following, JointSettings
+from projservo_cli.robots.contract import Bounds
+from projservo_cli.robots.joints import Joints
 from projservo_cli.settings.cameras import Cameras
-from projservo_cli.settings.control import Stop
+from projservo_cli.settings.control import ServoLimits, SpeedLimits, Stop
 from projservo_cli.settings.disturbance import EachView, Events
 from projservo_cli.settings.objects import Objects
+from projservo_cli.settings.robot import LimitSettings
 from projservo_cli.settings.sections import JointVector
 from projservo_cli.settings.task import GoalImages, TaskSettings, Trajectory
 from projservo_cli.simulation.arm import SerialArm
@@ -24,6 +27,62 @@ from projservo_cli.simulation.rendering import RenderedScene
 from projservo_cli.simulation.workspace import SceneObject, Truth
 from projservo_cli.task.incidences import Incidence
 from projservo_cli.task.stand_off import StandOff
+
+
+class JointSettings(NamedTuple):
+    """Joints as far as they are configured; data give the rest."""
+
+    types: str  # one letter a joint, R or P; empty where only a table gives them
+    ranges: tuple[tuple[float, float], ...] | None  # lowest and highest readings of an arm, rad or m
+    limits: LimitSettings | None  # of a robot without kinematics
+    unit: str  # in which somebody gave readings of revolute joints, deg or rad
+    known: int  # of how many joints readings were given; 0 where nobody did
+    speeds: SpeedLimits = SpeedLimits()
+
+    def joints(self, default_types: str = "", calibration: Calibration | None = None) -> Joints:
+        """Joints of the robot; of ``default_types``, else revolute ones, where their types are unknown.
+
+        calibration : whose data give limits where they are taken from there; without, none are.
+        """
+        types, pace = self.types or default_types or "R" * self.known, self.speeds
+        lower, upper = self._limits(types, calibration)
+        slides = [kind == "P" for kind in types]
+        speed = np.where(slides, pace.prismatic, pace.revolute)
+        acceleration = np.where(slides, pace.sliding, pace.turning)
+        units = tuple("m" if kind == "P" else self.unit for kind in types)
+        return Joints(types, JointLimits(lower, upper, speed, acceleration), units)
+
+    def _limits(self, types: str, calibration: Calibration | None) -> tuple[FloatArray, FloatArray]:
+        """Lower and upper limits (n,), rad or m; infinite where unknown."""
+        limits, pairs = self.limits, self.ranges
+        if limits is not None and limits.from_data is not None and calibration is not None:
+            share, span = limits.from_data, calibration.excitation
+            return calibration.joint_min - share * span, calibration.joint_min + (1.0 + share) * span
+        if limits is not None and limits.joints is not None:
+            if len(limits.joints) != len(types):
+                raise InputError(f"robot.limits.joints: give a pair for each of {len(types)} joints")
+            pairs = limits.values(types)
+        rows = pairs or ((-math.inf, math.inf),) * len(types)
+        lower, upper = np.array(rows, dtype=np.float64).reshape(-1, 2).T.copy()
+        return lower, upper
+
+
+class Following(NamedTuple):
+    """Pace of commands to a robot of the contract, and limits of its servos."""
+
+    period: float  # of commands, s
+    speed_scale: float  # factor of every command
+    servos: ServoLimits
+
+    def bounds(self, joints: Joints) -> Bounds:
+        """Return the bounds of commands, and limits of the servos."""
+        servos, speed = self.servos, joints.limits.speed * self.speed_scale
+        sag = joints.length_of(servos.max_steady_state_error_deg)
+        lead = speed * (servos.max_servo_lag_s + self.period) + sag
+        if servos.max_relative_target_deg is not None:
+            lead = joints.length_of(servos.max_relative_target_deg)
+        limits = joints.limits._replace(speed=speed)
+        return Bounds(limits, lead, self.period, servos.max_servo_lag_s, sag, joints.units)
 
 
 class OwnRobot(NamedTuple):

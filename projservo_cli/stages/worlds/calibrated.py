@@ -26,9 +26,9 @@ from projservo_cli.records import (
 )
 from projservo_cli.robots.client import DrivenRobot
 from projservo_cli.robots.contract import Reading, Robot
+from projservo_cli.robots.joints import Joints
 from projservo_cli.robots.pacing import Steered
 from projservo_cli.robots.session import Session
-from projservo_cli.robots.settings import Joints
 from projservo_cli.robots.standstill import STILL, seen_at_rest
 from projservo_cli.settings.task import GoalImages, TaskSettings
 from projservo_cli.simulation.analytic_plant import Ends, Plant

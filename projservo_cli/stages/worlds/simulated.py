@@ -22,9 +22,9 @@ from projservo_cli.records import (
 )
 from projservo_cli.robots.client import DrivenRobot, weights
 from projservo_cli.robots.contract import PluginRobot, Robot
+from projservo_cli.robots.joints import limit_passed
 from projservo_cli.robots.pacing import Steered
 from projservo_cli.robots.session import Session
-from projservo_cli.robots.settings import limit_passed
 from projservo_cli.settings.task import TaskSettings
 from projservo_cli.simulation.analytic_plant import NO_PINS, Ends, Plant, observe
 from projservo_cli.simulation.faults import FaultyRobot, Points, SimulatedRobot, observed_in_frames, robot_of
