@@ -14,12 +14,11 @@ import numpy as np
 
 from projservo_cli.config.loading import Config, stored_yaml
 from projservo_cli.config.whole import carriers_of, truth_of
-from projservo_cli.control.law import Gains
 from projservo_cli.detection import Board
 from projservo_cli.display import About
 from projservo_cli.records import ANGLE, CORNERS, MEET, PARALLEL, PERPENDICULAR, TOOL, InputError
 from projservo_cli.result_hashes import File
-from projservo_cli.settings.control import ServoLimits, SpeedLimits
+from projservo_cli.settings.control import LawSettings, RunConditions, ServoLimits, SpeedLimits
 from projservo_cli.settings.disturbance import Disturbance, Events, Faults
 from projservo_cli.settings.features import Feature, Pair
 from projservo_cli.settings.objects import ObjectSettings
@@ -278,32 +277,15 @@ def _displacement(config: Config) -> StandOff | None:
 
 def servo_inputs(config: Config, files: Files | None = None) -> ServoInputs:
     """Return the inputs of the run of a law."""
-    plan, control, plant = plan_inputs(config, files), config.control, config.plant
-    assert config.markers is not None
+    plan, conditions = plan_inputs(config, files), config.plant.part(RunConditions)
     _require_one_numbering(config, "servo")
-    # A robot that is not simulated is never driven beyond a limit.
-    at_limit = not plant.simulated or plant.joint_limits == "stop"
+    if not config.plant.simulated:  # such a robot is never driven beyond a limit
+        conditions = conditions.model_copy(update={"joint_limits": "stop"})
     return ServoInputs(
         plan=plan,
-        gains=Gains(
-            gain_t=control.gain_t,
-            gain_r=control.gain_r,
-            gain_p=control.gain_p,
-            gain_s=control.gain_s,
-            ratio_rp=control.ratio_rp,
-            gain=control.gain,
-            period=control.period_s,
-            visibility_fraction=plan.trajectory.visibility_fraction,
-            substeps=control.substeps == "auto",
-            scale=plant.speed_scale,
-        ),
+        laws=config.control.part(LawSettings),
         stop=config.stop,
-        at_joint_limit=at_limit,
-        at_border=plant.image_border == "stop",
-        opaque=plant.self_occlusion == "opaque",
-        speed_scale=plant.speed_scale,
-        max_replan_attempts=control.max_replan_attempts,
-        refuses=control.on_plan_failure == "refuse",
+        conditions=conditions,
         contract=_contract(config, plan, files),
     )
 
@@ -401,8 +383,7 @@ def about_of(config: Config, read: Iterable[File] = ()) -> About:
 
 def scenery_of(config: Config) -> Scenery:
     """Return the scene of runs; InputError if robot, rig and markers are not described."""
-    opaque = config.plant.self_occlusion == "opaque"
-    return Scenery(config.name, truth_of(config), opaque, config.plant.simulated)
+    return Scenery(config.name, truth_of(config), config.plant.opaque, config.plant.simulated)
 
 
 def files_of(config: Config, gone: Mapping[str, str] | None = None) -> Files:

@@ -79,8 +79,8 @@ class SpeedLimits(NamedTuple):
     sliding: float = math.inf
 
 
-class Control(Section):
-    """Control laws, their modes and gains, and the speed limits of the joints."""
+class LawChoice(Section):
+    """Control laws to run, their modes, and those that must converge."""
 
     laws: tuple[_Law, ...] = Field(
         tuple(law for law, spec in LAW_SPECS.items() if spec.paper),
@@ -93,6 +93,16 @@ class Control(Section):
         "image_track follow the plan; a list runs each law in those of the modes that it "
         "has",
     )
+    must_converge: tuple[_Law, ...] | None = Field(
+        None,
+        description="laws that fail the call (exit code 1) if they do not converge; null: "
+        "direct_three, direct_two, exact and plug-in laws",
+    )
+
+
+class LawSettings(Section):
+    """Period and gains of the control laws, and what becomes of plans that no joints follow."""
+
     on_plan_failure: Literal["regulate", "refuse"] = Field(
         "regulate",
         description="if no joints follow the plan: regulate runs the law without it, refuse does not "
@@ -101,11 +111,6 @@ class Control(Section):
     max_replan_attempts: Whole = Field(
         3,
         description="maximum number of replanning attempts of a run, profiles joint_space and auto",
-    )
-    must_converge: tuple[_Law, ...] | None = Field(
-        None,
-        description="laws that fail the call (exit code 1) if they do not converge; null: "
-        "direct_three, direct_two, exact and plug-in laws",
     )
     period_s: Positive = Field(0.04, description="control period")
     gain_t: Positive = Field(2.5, description="gain of the translation, 1/s")
@@ -116,6 +121,14 @@ class Control(Section):
     )
     ratio_rp: Positive = Field(1.0, description="ratio λ_r/λ_p of both rotations in direct_two")
     gain: Positive = Field(2.5, description="gain of the classical laws, 1/s")
+    substeps: Literal["none", "auto"] = Field(
+        "auto", description="auto lets the law exact send long steps in parts, none in one"
+    )
+
+
+class Control(LawSettings, LawChoice):
+    """Control laws, their modes and gains, and the speed limits of the joints."""
+
     joint_speed_limit_deg_s: Positive | None = Field(
         125.0, description="speed limit of revolute joints; null: none"
     )
@@ -127,9 +140,6 @@ class Control(Section):
     )
     prismatic_acceleration_limit_m_s2: Positive | None = Field(
         None, description="acceleration limit of prismatic joints, profile joint_space; null: 2"
-    )
-    substeps: Literal["none", "auto"] = Field(
-        "auto", description="auto lets the law exact send long steps in parts, none in one"
     )
     features: Literal["points", "body"] | None = Field(
         None,
@@ -218,7 +228,28 @@ class ServoLimits(Section):
     )
 
 
-class PlantSettings(ServoLimits, RobotClass):
+class RunConditions(Section):
+    """How fast a law drives the robot, what its cameras see, and where a run of it stops."""
+
+    speed_scale: Number = Field(1.0, gt=0, le=1, description="factor of all commanded velocities")
+    self_occlusion: Literal["transparent", "opaque"] = Field(
+        "transparent",
+        description="whether a camera behind the face sees its markers (transparent) or not (opaque)",
+    )
+    joint_limits: Literal["report", "stop"] = Field(
+        "report", description="a joint limit is reported, or stops the run"
+    )
+    image_border: Literal["report", "stop"] = Field(
+        "report", description="a marker outside an image is reported, or stops the run"
+    )
+
+    @property
+    def opaque(self) -> bool:
+        """Whether the face hides its markers from a camera behind it."""
+        return self.self_occlusion == "opaque"
+
+
+class PlantSettings(RunConditions, ServoLimits, RobotClass):
     """The robot to drive, and the behaviour of a simulated one at its limits.
 
     ``use`` names the class of an external robot and ``options`` its arguments. The loop never commands an
@@ -235,17 +266,6 @@ class PlantSettings(ServoLimits, RobotClass):
     )
     settle_s: Positive = Field(
         0.5, description="time for which joints and images rest before a pose is recorded"
-    )
-    speed_scale: Number = Field(1.0, gt=0, le=1, description="factor of all commanded velocities")
-    self_occlusion: Literal["transparent", "opaque"] = Field(
-        "transparent",
-        description="whether a camera behind the face sees its markers (transparent) or not (opaque)",
-    )
-    joint_limits: Literal["report", "stop"] = Field(
-        "report", description="a joint limit is reported, or stops the run"
-    )
-    image_border: Literal["report", "stop"] = Field(
-        "report", description="a marker outside an image is reported, or stops the run"
     )
 
 

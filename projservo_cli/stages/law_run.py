@@ -162,7 +162,7 @@ class LawRun:
         scenario, execution = self.scenario, None
         if self.is_guided and isinstance(law, BuiltInLaw):
             assert isinstance(self.plan, Plan)
-            follow, searches = partial(self._task, law.law.model), scenario.servo.max_replan_attempts
+            follow, searches = partial(self._task, law.law.model), scenario.servo.laws.max_replan_attempts
             replanner = PathReplanner(scenario, self.plan)
             blind, limits = self.blind or scenario.world.moves_unseen, scenario.termination
             execution = ExecutionMonitor(law, follow, replanner, searches, limits, stall, blind=blind)
@@ -172,7 +172,7 @@ class LawRun:
             scenario.ends.by_points().s_star,
             scenario.gains.period,
             scenario.termination,
-            scenario.servo.speed_scale,
+            scenario.gains.scale,
             stall=stall,
             execution=execution,
         )
@@ -196,7 +196,7 @@ class LawRun:
     def _task(self, model: Model, plan: Plan) -> Task:
         """The task as a built-in law with a model is given it, with the plan that it follows."""
         scenario = self.scenario
-        task, scale = scenario.images_for(self.law).task(model), scenario.servo.speed_scale
+        task, scale = scenario.images_for(self.law).task(model), scenario.gains.scale
         return followed(model, task, plan, scenario.gains.period, scale)
 
     def _images(self) -> TaskImages:

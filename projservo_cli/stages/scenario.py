@@ -218,7 +218,7 @@ class RunScenario(Scenario):
     def plant_of(self, law: str) -> Plant:
         """The robot as a law sees it."""
         images, pins = partial(self.images_for, law), self.measures_body(law)
-        return self.world.plant(self.exact.q_start, images, pins=pins, opaque=self.servo.opaque)
+        return self.world.plant(self.exact.q_start, images, pins=pins, opaque=self.servo.conditions.opaque)
 
 
 def world_of(inputs: PlanInputs, calibration: Calibration) -> CalibratedWorld:
@@ -295,7 +295,7 @@ def _positions(
 
 def run_scenario(inputs: ServoInputs, calibration: Calibration) -> RunScenario:
     """Make the scenario of runs; raises as ``scenario_of``. Noise widens the tolerance of the image error."""
-    found, stop = scenario_of(inputs.plan, calibration), inputs.stop
+    found, stop, conditions = scenario_of(inputs.plan, calibration), inputs.stop, inputs.conditions
     limits, noise_px = found.world.joints.limits, stop.noise_factor * found.world.noise_px
     termination = Limits(
         speed=limits.speed,
@@ -303,15 +303,28 @@ def run_scenario(inputs: ServoInputs, calibration: Calibration) -> RunScenario:
         diverged_factor=stop.diverged_factor,
         stall_periods=stop.stall_periods,
         max_steps=stop.max_steps,
-        stop_at_joint_limit=inputs.at_joint_limit,
-        stop_at_border=inputs.at_border,
+        stop_at_joint_limit=conditions.joint_limits == "stop",
+        stop_at_border=conditions.image_border == "stop",
         max_lost_periods=stop.max_lost_periods,
         noise_px=noise_px,
     )
-    if not inputs.at_joint_limit:  # a run may pass them, so that they end no path
+    if not termination.stop_at_joint_limit:  # a run may pass them, so that they end no path
         endless = np.full(len(found.world.joints.types), math.inf)
         limits = limits._replace(lower=-endless, upper=endless)
-    gains = inputs.gains._replace(limits=limits)
+    laws = inputs.laws
+    gains = Gains(
+        gain_t=laws.gain_t,
+        gain_r=laws.gain_r,
+        gain_p=laws.gain_p,
+        gain_s=laws.gain_s,
+        ratio_rp=laws.ratio_rp,
+        gain=laws.gain,
+        period=laws.period_s,
+        visibility_fraction=inputs.plan.trajectory.visibility_fraction,
+        limits=limits,
+        substeps=laws.substeps == "auto",
+        scale=conditions.speed_scale,
+    )
     # What was just made holds its fields alone: nothing is derived from them yet.
     return RunScenario(**vars(found), servo=inputs, gains=gains, termination=termination)
 

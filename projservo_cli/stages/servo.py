@@ -75,10 +75,10 @@ def drive(
     if scenario.world.inputs.trajectory.keep_out and not (isinstance(plan, Plan) and plan.feasible):
         raise WorkFailed("the plan is not feasible, and with trajectory.keep_out no law runs without one")
     if mode != REGULATE and isinstance(plan, Plan):
-        if not np.isfinite(plan.q).all() and not scenario.servo.refuses:
+        if not np.isfinite(plan.q).all() and scenario.servo.laws.on_plan_failure == "regulate":
             unplanned = f"no joints can follow the plan: {plan.reason}"
         elif plan.duration is not None:
-            planned_s = plan.duration / scenario.servo.speed_scale
+            planned_s = plan.duration / scenario.gains.scale
     run = LawRun(scenario, plan, law, mode, planned_s, unplanned, believed, **brought)
     if scenario.servo.contract is not None:
         run.by_contract()
@@ -91,7 +91,7 @@ def drive(
 
 def _in_compiled_loop(inputs: ServoInputs, law: str) -> bool:
     """Whether the compiled loop runs a law; the others are run in Python and are given the whole plan."""
-    return law in CODES and inputs.speed_scale == 1.0 and inputs.contract is None
+    return law in CODES and inputs.conditions.speed_scale == 1.0 and inputs.contract is None
 
 
 def sense_is_enough(inputs: ServoInputs, name: str) -> bool:

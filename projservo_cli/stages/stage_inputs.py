@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from projservo_cli.control.law import Gains
 from projservo_cli.detection import Board
 from projservo_cli.display import About
 from projservo_cli.image_size import ImageSize
@@ -15,7 +14,7 @@ from projservo_cli.result_hashes import File, digest, encoded
 from projservo_cli.robots.contract import Bounds
 from projservo_cli.robots.joints import Joints
 from projservo_cli.settings.cameras import Cameras
-from projservo_cli.settings.control import ServoLimits, SpeedLimits, Stop
+from projservo_cli.settings.control import LawSettings, RunConditions, ServoLimits, SpeedLimits, Stop
 from projservo_cli.settings.disturbance import EachView, Events
 from projservo_cli.settings.objects import Objects
 from projservo_cli.settings.robot import LimitSettings
@@ -306,14 +305,9 @@ class ServoInputs:
     """Inputs of the run of a law, except calibration and plan."""
 
     plan: PlanInputs  # inputs of the plan
-    gains: Gains  # of the laws; limits are those of the joints
+    laws: LawSettings
     stop: Stop
-    at_joint_limit: bool
-    at_border: bool  # at_joint_limit, at_border: whether they end a run
-    opaque: bool  # whether the face hides its markers from a camera behind it
-    speed_scale: float  # factor of every command
-    max_replan_attempts: int  # maximum number of replanning attempts
-    refuses: bool  # whether a law is not run where no joints could follow the plan
+    conditions: RunConditions
     contract: Contract | None  # None for the ideal plant
 
 
