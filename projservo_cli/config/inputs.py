@@ -14,15 +14,16 @@ import numpy as np
 
 from projservo_cli.config.loading import Config, stored_yaml
 from projservo_cli.config.whole import carriers_of, truth_of
-from projservo_cli.detection import Board
 from projservo_cli.display import About
 from projservo_cli.records import ANGLE, CORNERS, MEET, PARALLEL, PERPENDICULAR, TOOL, InputError
 from projservo_cli.result_hashes import File
-from projservo_cli.settings.control import LawSettings, RunConditions, ServoLimits, SpeedLimits
+from projservo_cli.settings.control import LawSettings, Rest, RunConditions, ServoLimits, SpeedLimits
 from projservo_cli.settings.disturbance import Disturbance, Events, Faults
 from projservo_cli.settings.features import Feature, Pair
+from projservo_cli.settings.markers import Markers
 from projservo_cli.settings.objects import ObjectSettings
 from projservo_cli.settings.task import Goal as GoalSettings
+from projservo_cli.settings.trials import LoopNoise
 from projservo_cli.simulation.described import (
     arm_of,
     cameras_of,
@@ -86,7 +87,6 @@ def calibration_inputs(config: Config, files: Files | None = None) -> Calibratio
     else:
         # A factor of commands to a robot that may do harm; what simulated trials show does not hang on it.
         source = _trials(config, truth_of(config, face=False), files, speed_scale=1.0)
-    noise = None if settings.joint_noise_deg is None else float(np.radians(settings.joint_noise_deg))
     how = Estimation(
         settings.lens,
         _file(config, "init", files),
@@ -94,7 +94,7 @@ def calibration_inputs(config: Config, files: Files | None = None) -> Calibratio
         settings.max_predicted_px,
         settings.joint_model,
     )
-    inputs: CalibrationInputs | RefitInputs = CalibrationInputs(source, how, noise)
+    inputs: CalibrationInputs | RefitInputs = CalibrationInputs(source, how, settings.joint_noise)
     for i, one in enumerate(settings.refits):
         seen, readings = (_file(config, f"{kind} {i}", files) for kind in _REFIT)
         assert seen is not None
@@ -106,13 +106,11 @@ def calibration_inputs(config: Config, files: Files | None = None) -> Calibratio
 
 def recording_inputs(config: Config) -> RecordingInputs:
     """Return the inputs of a recording."""
-    markers, plant = config.markers, config.plant
+    markers, plant = _markers(config), config.plant
     truth = truth_of(config, face=False) if plant.simulated else None
     numbers = _numbers(config, "record")
-    assert markers is not None
-    trials = _trials(config, truth)
     # A robot that a caller brings along takes the place of the ideal plant too.
-    trials = replace(trials, averaged_frames=plant.averaged_frames, settle_s=plant.settle_s)
+    trials = replace(_trials(config, truth), rest=plant.part(Rest))
     return RecordingInputs(
         trials=trials,
         numbers=numbers,
@@ -131,8 +129,7 @@ def teach_inputs(config: Config) -> TeachInputs:
     _require_one_numbering(config, "teach")
     driven = _drive(config, truth_of(config) if config.plant.simulated else None, shows=True)
     noise, settle_s = config.noise.servo_px, config.plant.settle_s
-    objects = tuple((name, one.numbers) for name, one in config.objects.named.items())
-    return TeachInputs(driven, joints_of(config), numbers, noise, settle_s, config.seed, objects)
+    return TeachInputs(driven, joints_of(config), numbers, noise, settle_s, config.seed, config.objects)
 
 
 def preflight_inputs(config: Config) -> PreflightInputs:
@@ -141,47 +138,38 @@ def preflight_inputs(config: Config) -> PreflightInputs:
         raise InputError(
             "doctor -c checks a robot and its cameras, and this one is simulated: set plant.use and cameras"
         )
-    numbers = _numbers(config, "doctor")
-    assert config.markers is not None
-    face = config.markers.front or ()
     return PreflightInputs(
         driven=_drive(config, None),
         joints=joints_of(config),
-        numbers=numbers,
-        face=face,
-        lengths=config.markers.lengths(face),
+        numbers=_numbers(config, "doctor"),
+        markers=_markers(config),
         dictionary=_dictionary(config),
         mount=config.mount,
         noise_px=(config.stop.innovation_threshold or 1.0) * config.noise.servo_px,
-        board=_board(config),
     )
+
+
+def _markers(config: Config) -> Markers:
+    """Return the markers as far as they are given."""
+    return config.markers or Markers()
 
 
 def _numbers(config: Config, command: str) -> tuple[int, ...]:
     """Numbers of the markers that a robot observes. Raises InputError where they are unknown."""
-    numbers = config.markers.known if config.markers is not None else None
-    if numbers is None:
+    if (numbers := _markers(config).known) is None:
         raise InputError(f"{command} needs to know which markers the robot observes: set markers.numbers")
     return numbers
 
 
 def _dictionary(config: Config) -> str | None:
     """Dictionary of the tags: that of the options of a robot's class, else that of the markers."""
-    markers = config.markers
-    own = None if markers is None else (markers.board or markers).dictionary
-    given = config.plant.options.get("dictionary", own)
+    given = config.plant.options.get("dictionary", _markers(config).tag_dictionary)
     return None if given is None else str(given)
-
-
-def _board(config: Config) -> Board | None:
-    """Board whose corners are the markers; None without one."""
-    board = None if config.markers is None else config.markers.board
-    return None if board is None else board.pattern
 
 
 def _require_one_numbering(config: Config, command: str) -> None:
     """Refuse a board on the tool of which an image may number the corners from another end than the goal."""
-    board = _board(config)
+    board = _markers(config).pattern
     if board is not None and board.symmetric and config.cameras is not None and not config.plant.simulated:
         raise InputError(
             f"markers.board: a {board} looks the same turned by 180°, so that images of {command} may number "
@@ -202,8 +190,7 @@ def plan_inputs(config: Config, files: Files | None = None, *, predicted: bool =
 
     predicted : whether a calibration predicts start and goal of a simulated robot, which is not described.
     """
-    face, markers = config.face_numbers, config.markers
-    assert markers is not None
+    face, markers = config.face_numbers, _markers(config)
     simulated = config.plant.simulated and not predicted
     known = markers.known if markers.tags is not None else ()
     pairs, carriers = () if config.task is None else config.task.goal.incidences, _carriers(config, files)
@@ -223,8 +210,7 @@ def plan_inputs(config: Config, files: Files | None = None, *, predicted: bool =
         tags=tuple(known[i : i + CORNERS] for i in range(0, len(known or ()), CORNERS)) if known else (),
         joints=joints_of(config),
         image_size=config.image_size_px,
-        noise_px=config.noise.servo_px,
-        averaged_frames=config.noise.averaged_frames,
+        noise=config.noise.part(LoopNoise),
         features=config.control.features,
         tests_images=config.stop.innovation_threshold > 0.0,
         trajectory=config.trajectory,
@@ -304,15 +290,13 @@ def _carrier(config: Config, files: Files | None, name: str, goal: GoalSettings)
     simulated = config.plant.simulated
     return CarryingObject(
         name=name,
-        numbers=config.objects.named[name].numbers,
+        objects=config.objects,
         taught=goal.objects.of(name),
         placed=next((one for one in objects_of(config) if one.name == name), None) if simulated else None,
         at_first=scene_of(config, files, dict.fromkeys(config.objects.named)) if rendered else None,
         driven=None if simulated else _drive(config, None, files),
-        frames=config.plant.averaged_frames,
-        settle_s=config.plant.settle_s,
+        rest=config.plant.part(Rest),
         lengths=_known_lengths(config),
-        limits=config.objects,
     )
 
 
@@ -356,9 +340,7 @@ def report_inputs(config: Config, files: Files | None = None) -> ReportInputs:
 
 def _known_lengths(config: Config) -> KnownLengths:
     """Return the lengths on the tool that the configuration knows."""
-    markers = config.markers
-    if markers is None:
-        return KnownLengths((), np.zeros((0, 0)), None, ())
+    markers = _markers(config)
     numbers = markers.known or ()
     side = markers.tag_size_m if markers.points is None else None
     return KnownLengths(numbers, markers.lengths(numbers), side, markers.front or ())
@@ -432,18 +414,15 @@ def scene_of(
     objects : those that stand in it; with None in place of their sections, where goals were taught.
     """
     options = config.plant.rendered
-    if options is None:
+    if options is None or config.arm is None or config.rig is None:
         return None
-    assert config.arm is not None
-    assert config.rig is not None
-    assert config.markers is not None
     tags = [
         tag.at(np.eye(4) if now is None else now.moved)
         for name, now in (objects or {}).items()
         for tag in config.objects.named[name].placed
     ]
     mjcf = _file(config, "mjcf", files)
-    return described_scene(config.arm, config.rig, config.markers, options, mjcf, tuple(tags))
+    return described_scene(config.arm, config.rig, _markers(config), options, mjcf, tuple(tags))
 
 
 # What drives.
@@ -489,11 +468,17 @@ def _drive(
 
 def _own(config: Config) -> OwnRobot:
     """The robot of somebody's."""
-    plant, markers = config.plant, config.markers
-    dictionary = (markers.board or markers).dictionary if markers is not None else None
-    size, options = config.image_size_px, dict(plant.options)
-    times = plant.timeout_s, plant.open_s
-    return OwnRobot(plant.use or "", options, dictionary, *times, size, config.cameras, _board(config))
+    plant, markers = config.plant, _markers(config)
+    return OwnRobot(
+        target=plant.use or "",
+        options=dict(plant.options),
+        dictionary=markers.tag_dictionary,
+        timeout_s=plant.timeout_s,
+        open_s=plant.open_s,
+        image_size=config.image_size_px,
+        cameras=config.cameras,
+        board=markers.pattern,
+    )
 
 
 # Trials.
@@ -521,7 +506,7 @@ def _trials(
         poses = _RANDOM_POSES if driven else 0
     motions = Motions(
         reference,
-        (math.radians(settings.amplitude_deg), settings.amplitude_m),
+        settings.amplitudes,
         settings.frames_per_joint,
         poses,
         2.0 * math.pi / (config.disturbance.encoder_counts_per_turn or _TICKS) if driven else 0.0,
@@ -533,6 +518,5 @@ def _trials(
         truth=truth,
         driven=_drive(config, truth, files, speed_scale) if driven else None,
         noise_px=config.noise.calibration_px,
-        averaged_frames=plant.averaged_frames if driven else 1,
-        settle_s=plant.settle_s if driven else 0.0,
+        rest=plant.part(Rest) if driven else Rest(),
     )

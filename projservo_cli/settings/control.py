@@ -228,6 +228,17 @@ class ServoLimits(Section):
     )
 
 
+class Rest(Section):
+    """For how long a robot stands still before it is looked at, and how many images are averaged then."""
+
+    averaged_frames: StrictInt = Field(
+        1, ge=1, le=1000, description="number of images of each pose that record averages"
+    )
+    settle_s: Positive = Field(
+        0.5, description="time for which joints and images rest before a pose is recorded"
+    )
+
+
 class RunConditions(Section):
     """How fast a law drives the robot, what its cameras see, and where a run of it stops."""
 
@@ -249,7 +260,7 @@ class RunConditions(Section):
         return self.self_occlusion == "opaque"
 
 
-class PlantSettings(RunConditions, ServoLimits, RobotClass):
+class PlantSettings(RunConditions, Rest, ServoLimits, RobotClass):
     """The robot to drive, and the behaviour of a simulated one at its limits.
 
     ``use`` names the class of an external robot and ``options`` its arguments. The loop never commands an
@@ -260,12 +271,6 @@ class PlantSettings(RunConditions, ServoLimits, RobotClass):
         None,
         description="time from the middle of an exposure to the joint readings that arrive with its "
         "image; a number for all cameras, or {left, right} or other names; null: estimated",
-    )
-    averaged_frames: StrictInt = Field(
-        1, ge=1, le=1000, description="number of images of each pose that record averages"
-    )
-    settle_s: Positive = Field(
-        0.5, description="time for which joints and images rest before a pose is recorded"
     )
 
 

@@ -158,6 +158,16 @@ class Markers(Section):
         )
 
     @property
+    def pattern(self) -> Board | None:
+        """The board as it is detected; None without one."""
+        return None if self.board is None else self.board.pattern
+
+    @property
+    def tag_dictionary(self) -> str | None:
+        """Dictionary of the tags, which may be those on the board; None if not given."""
+        return (self.board or self).dictionary
+
+    @property
     def points(self) -> FloatArray | None:
         """Positions (m, 3) of all markers in the frame of the tool, m; None where they are not known."""
         if self.tags is not None:

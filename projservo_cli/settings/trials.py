@@ -1,5 +1,6 @@
 """Trial motions, the table that stands in for them, and how they are evaluated."""
 
+import math
 from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, StrictBool, StrictInt, StringConstraints
@@ -17,16 +18,26 @@ from projservo_cli.settings.sections import (
 )
 
 
-class Noise(Section):
-    """Standard deviation of simulated pixel noise, per coordinate."""
+class LoopNoise(Section):
+    """Noise of the closed loop, and of the images of start and goal."""
 
-    calibration_px: NotNegative = Field(0.5, description="pixel noise of the trial motions")
     servo_px: NotNegative = Field(
         0.0, description="pixel noise of the closed loop, and of the images of start and goal"
     )
     averaged_frames: Count = Field(
         1, description="number of images averaged at the start and at the goal, where the robot rests"
     )
+
+    @property
+    def at_rest_px(self) -> float:
+        """Standard deviation of a coordinate in the averaged images of start and goal."""
+        return self.servo_px / math.sqrt(self.averaged_frames)
+
+
+class Noise(LoopNoise):
+    """Standard deviation of simulated pixel noise, per coordinate."""
+
+    calibration_px: NotNegative = Field(0.5, description="pixel noise of the trial motions")
     tail_dof: Number | None = Field(
         None, gt=2, description="degrees of freedom of Student's t, of the same deviation; null: normal noise"
     )
@@ -112,6 +123,16 @@ class CalibrationSettings(Section):
         (),
         description="cameras that moved since, each fitted again, in this order, as calibrate --refit does",
     )
+
+    @property
+    def amplitudes(self) -> tuple[float, float]:
+        """Maximum trial motion to each side, revolute joints, rad, and prismatic ones, m."""
+        return math.radians(self.amplitude_deg), self.amplitude_m
+
+    @property
+    def joint_noise(self) -> float | None:
+        """Standard deviation of joint readings, rad; None where it is not given."""
+        return None if self.joint_noise_deg is None else math.radians(self.joint_noise_deg)
 
 
 class Data(Section):

@@ -63,7 +63,7 @@ def _carried(scenario: Scenario, carrier: CarryingObject, session: Session | Non
         goal = found.carry(_goal(scenario, c))
     except WorkFailed as error:
         raise words.failed(error.findings, stage=f"objects.{carrier.name}") from error
-    rigid, limits = found.coordinates == 6, carrier.limits
+    rigid, limits = found.coordinates == 6, carrier.objects
     carried = CarriedByObject(
         object_name=carrier.name,
         object_shift_mm=_known(found.shift_mm),
@@ -106,7 +106,7 @@ def _in_body(found: DisplacedObject, H: FloatArray, numbers: Sequence[int]) -> F
 
 def too_far(carried: CarriedByObject, carrier: CarryingObject) -> Finding | None:
     """Return why somebody should look before a robot goes to a carried goal; None if that is not needed."""
-    limits, subject = carrier.limits, Subject(name=carrier.name)
+    limits, subject = carrier.objects, Subject(name=carrier.name)
     for at, most, unit in (
         (carried.object_shift_mm and 1e-3 * carried.object_shift_mm, limits.max_displacement_m, "m"),
         (
@@ -133,5 +133,5 @@ def _goal(scenario: Scenario, c: Calibration) -> Look:
     s[:, c.indices_of(scenario.world.numbers)] = scenario.world.shown(
         scenario.exact, scenario.q_taught, scenario.world.inputs.seed
     ).s_star
-    noise = scenario.world.inputs.noise_px / math.sqrt(scenario.world.inputs.averaged_frames)
+    noise = scenario.world.inputs.noise.at_rest_px
     return Look(s, np.full(s.shape[:2], noise) if noise > 0.0 else None)

@@ -88,12 +88,12 @@ def check(
             if watch is not None:
                 watch(robot)
             at_rest = _seen(robot, inputs, progress)
-            findings += findings_at_rest(
-                at_rest, finder_of(inputs.board, dictionary), dictionary, moves=confirmed is not None
-            )
+            finder, moves = finder_of(inputs.markers.pattern, dictionary), confirmed is not None
+            findings += findings_at_rest(at_rest, finder, dictionary, moves=moves)
             if calibration is not None:
                 size, seen = robot.image_size, at_rest.of_views(calibration.view)
-                found = calibration_finding(calibration, seen, size, inputs.lengths, inputs.noise_px)
+                lengths = inputs.markers.lengths(at_rest.face)
+                found = calibration_finding(calibration, seen, size, lengths, inputs.noise_px)
                 more, mend = mended_by_refit(found, calibration, seen, size)
                 findings += (found, *more)
             if confirmed is not None and not usable(findings):
@@ -136,7 +136,7 @@ def _seen(robot: PluginRobot, inputs: PreflightInputs, progress: Progress) -> Ro
         cameras, views = own.cameras, [view for view in own.views if view is not None]
     return RobotAtRest(
         marker=inputs.numbers,
-        face=inputs.face,
+        face=inputs.markers.front or (),
         q=np.mean([look.q for look in readings], axis=0),
         s=np.stack(s),
         sigma=readings[-1].sigma_px,

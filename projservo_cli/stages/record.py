@@ -395,7 +395,7 @@ def observed(
     simulated = trials.driven.robot
     if not isinstance(simulated, OwnRobot) and simulated.scene is not None:
         return recording.observation(), None
-    return recording.observation(), sigma_px / math.sqrt(trials.averaged_frames) or None
+    return recording.observation(), sigma_px / math.sqrt(trials.rest.averaged_frames) or None
 
 
 def _simulated(trials: Trials, recording: _Recording, drawn: tuple[int, int]) -> Iterator[int]:
@@ -429,7 +429,7 @@ class _Sight:
         """Refuse to move if the first readings, for a while, show too few markers."""
         period, waited = robot.bounds.period, 0.0
         while wrong := self._wrong(reading.s[None], Subject()):
-            if waited >= self.inputs.trials.settle_s:  # a camera may need some time for its first image
+            if waited >= self.inputs.trials.rest.settle_s:  # a camera may need some time for its first image
                 raise words.failed([wrong], self.setup, "; nothing was moved", stage="record")
             time.sleep(period)
             waited, reading = waited + period, robot.read()
@@ -522,7 +522,7 @@ def _recorded(
 
     sight : checks of the observations, if any.
     """
-    steered, settle_s = Steered(robot), trials.settle_s
+    steered, settle_s = Steered(robot), trials.rest.settle_s
     fit = None if sight is None else partial(sight.before, robot)
     if sight is not None:
         for pose in recording.done:  # those of a call before
@@ -537,7 +537,7 @@ def _recorded(
         seen = list(path_to(steered, recording.targets[pose], settle_s, "record", fit))
         fit = None
         recording.commands += len(seen)
-        recording.done[pose], squares, count = averaged(steered.reading, observe, trials.averaged_frames)
+        recording.done[pose], squares, count = averaged(steered.reading, observe, trials.rest.averaged_frames)
         recording.scatter += squares.sum(), 2.0 * np.maximum(count - 1, 0).sum()
         recording.motion_readings[pose + 1] = _moving(seen, settle_s)
         if sight is not None:

@@ -156,9 +156,9 @@ class Scenario:
             if images is None
             else images.sigma_px(self.world.numbers[: self.world.m], self.world.inputs.face)
         )
-        return (
-            self.world.noise_px / math.sqrt(self.world.inputs.averaged_frames) if stated is None else stated
-        )
+        if stated is not None:
+            return stated
+        return self.world.noise_px / math.sqrt(self.world.inputs.noise.averaged_frames)
 
     @property
     def goal_error_px(self) -> float:

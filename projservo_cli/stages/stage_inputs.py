@@ -14,12 +14,14 @@ from projservo_cli.result_hashes import File, digest, encoded
 from projservo_cli.robots.contract import Bounds
 from projservo_cli.robots.joints import Joints
 from projservo_cli.settings.cameras import Cameras
-from projservo_cli.settings.control import LawSettings, RunConditions, ServoLimits, SpeedLimits, Stop
+from projservo_cli.settings.control import LawSettings, Rest, RunConditions, ServoLimits, SpeedLimits, Stop
 from projservo_cli.settings.disturbance import EachView, Events
+from projservo_cli.settings.markers import Markers
 from projservo_cli.settings.objects import Objects
 from projservo_cli.settings.robot import LimitSettings
 from projservo_cli.settings.sections import JointVector
 from projservo_cli.settings.task import GoalImages, TaskSettings, Trajectory
+from projservo_cli.settings.trials import LoopNoise
 from projservo_cli.simulation.arm import SerialArm
 from projservo_cli.simulation.faults import SimulatedRobot
 from projservo_cli.simulation.rendering import RenderedScene
@@ -127,8 +129,7 @@ class Trials:
     truth: Truth | None  # robot, rig and markers as they are; None for a robot of somebody's
     driven: Drive | None  # by the contract; None for one that stands wherever it is sent
     noise_px: float  # standard deviation of simulated pixels
-    averaged_frames: int  # images of each pose that are averaged
-    settle_s: float  # for how long joints and images have stood still before
+    rest: Rest  # at each pose, of a robot that is driven
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,7 +154,7 @@ class RecordingInputs:
         robot = (
             own._replace(timeout_s=0.0, open_s=0.0, cameras=None) if own else (trials.truth, trials.driven)
         )
-        how = trials.motions.seed, trials.noise_px, trials.averaged_frames, trials.settle_s
+        how = trials.motions.seed, trials.noise_px, trials.rest.averaged_frames, trials.rest.settle_s
         key = digest(encoded((robot, how, self.numbers, self.dictionary)))
         return f"{own.target if own else 'simulated'} {key[:16]}"
 
@@ -231,7 +232,7 @@ class TeachInputs:
     noise_px: float  # standard deviation of simulated pixels
     settle_s: float  # for how long joints and images have stood still before
     seed: int
-    objects: tuple[tuple[str, tuple[int, ...]], ...] = ()  # names of objects, and numbers of their markers
+    objects: Objects
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,12 +242,10 @@ class PreflightInputs:
     driven: Drive
     joints: JointSettings
     numbers: tuple[int, ...]  # of the markers
-    face: tuple[int, ...]  # numbers of the markers that must stay visible; may be empty
-    lengths: FloatArray  # (f, f) distances between these, m; NaN if unknown
+    markers: Markers
     dictionary: str | None  # of the tags; None if not configured
     mount: str  # of the cameras, world or tool
     noise_px: float  # of the images of a run, with the factor of its test
-    board: Board | None = None  # whose corners are the markers; None for tags
 
 
 @dataclass(frozen=True, eq=False)
@@ -267,8 +266,7 @@ class PlanInputs:
     tags: tuple[tuple[int, ...], ...]  # numbers of the corners of each tag among them
     joints: JointSettings
     image_size: ImageSize | None  # width and height, px, of both images or of one each, if known
-    noise_px: float  # standard deviation of simulated pixels
-    averaged_frames: int  # that are averaged of start and goal
+    noise: LoopNoise  # of simulated pixels
     features: str | None  # points, body, or None for body where the calibration is usable
     tests_images: bool  # whether images are tested against the calibration
     trajectory: Trajectory
@@ -325,15 +323,18 @@ class CarryingObject:
     """Object that a goal was taught on, and is carried by."""
 
     name: str
-    numbers: tuple[int, ...]  # of its markers
+    objects: Objects  # all of them, how far they may have moved, and how uncertain the goal may be
     taught: GoalImages | None  # its images when the goal was taught; None for those of a simulation
     placed: SceneObject | None  # where it is in a simulation
     at_first: RenderedScene | None  # scene with it where it was when the goal was taught
     driven: Drive | None  # robot that looks at it; None where images are simulated by themselves
-    frames: int  # images of it that such a robot averages
-    settle_s: float  # for how long joints and images have stood still before
+    rest: Rest  # of such a robot
     lengths: KnownLengths
-    limits: Objects  # how far it may have moved, and how uncertain the goal may be
+
+    @property
+    def numbers(self) -> tuple[int, ...]:
+        """Numbers of its markers."""
+        return self.objects.named[self.name].numbers
 
 
 @dataclass(frozen=True, eq=False)

@@ -162,7 +162,8 @@ def teach(
         seen=frames_of(looks, np.array(inputs.numbers, dtype=np.int64)),
     )
     begin, objects = len(inputs.numbers), dict[str, _Taught]()
-    for name, numbers in inputs.objects:
+    for name, one in inputs.objects.named.items():
+        numbers = one.numbers
         own, begin = slice(begin, begin + len(numbers)), begin + len(numbers)
         marker, nowhere = np.array(numbers, dtype=np.int64), np.zeros(0)
         objects[name] = replace(tool, marker=marker, q=nowhere, s=mean.s[:, own], sigma=sigma[:, own])
@@ -266,7 +267,7 @@ def checked(inputs: PlanInputs, calibration: Calibration, taught: _Taught) -> _C
     )
     frames, fresh = taught.seen
     frames, fresh = of_views(frames, calibration.view), fresh[:, views]
-    size, noise_px = image_sizes(inputs.image_size, calibration.view), inputs.noise_px
+    size, noise_px = image_sizes(inputs.image_size, calibration.view), inputs.noise.servo_px
     try:
         if fault := fault_at_rest(calibration, frames, size, sigma_px=noise_px, fresh=fresh):
             setup = words.setup_of(calibration)

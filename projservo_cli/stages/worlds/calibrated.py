@@ -121,7 +121,7 @@ class CalibratedWorld:
     @property
     def noise_px(self) -> float:
         """Standard deviation of a coordinate of images in the loop, px."""
-        return max(self.inputs.noise_px, self.calibration.fit.sigma_fitted_px)
+        return max(self.inputs.noise.servo_px, self.calibration.fit.sigma_fitted_px)
 
     def ends(self, task: TaskSettings) -> tuple[TaskImages, FloatArray | None]:
         """Return start and goal without noise, and the joints (n,) at the goal, None for one by images alone.
@@ -192,6 +192,7 @@ class CalibratedWorld:
     def _look_now(self, carrier: CarryingObject, session: Session | None, q_start: FloatArray) -> Look:
         """Images of an object by the robot where it stands, or by a simulated one at the start (n,)."""
         assert carrier.driven is not None
+        rest = carrier.rest
         with nullcontext(session) if session else Session() as own:
             known = self.joints, self.observed, self.view
             robot = opened_robot(own, carrier.driven, *known).robot
@@ -200,7 +201,7 @@ class CalibratedWorld:
                 time.sleep(robot.bounds.period)
                 return robot.read().whole
 
-            _, mean, sigma, *_ = seen_at_rest(robot, observe, carrier.frames, carrier.settle_s, "plan")
+            _, mean, sigma, *_ = seen_at_rest(robot, observe, rest.averaged_frames, rest.settle_s, "plan")
         which = [len(self.observed) + carrier.driven.further.index(number) for number in carrier.numbers]
         return Look(mean.s[:, which], sigma[:, which])
 

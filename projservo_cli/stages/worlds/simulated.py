@@ -1,6 +1,5 @@
 """Simulated worlds: the truth, seen as points or by rendered cameras."""
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -72,7 +71,7 @@ class SimulatedWorld(CalibratedWorld):
     @property
     def noise_px(self) -> float:
         """Standard deviation of a coordinate of images in the loop, px."""
-        return self.inputs.noise_px
+        return self.inputs.noise.servo_px
 
     def ends(self, task: TaskSettings) -> tuple[TaskImages, FloatArray | None]:
         """Return start and goal without noise, and the joints (n,) at the goal, if they are known."""
@@ -130,7 +129,7 @@ class SimulatedWorld(CalibratedWorld):
 
     def shown(self, images: TaskImages, q_taught: FloatArray | None, seed: int) -> TaskImages:
         """Start and taught goal with the noise of a seed; given images of the goal stay as they are."""
-        sigma = self.inputs.noise_px / math.sqrt(self.inputs.averaged_frames)
+        sigma = self.inputs.noise.at_rest_px
         if sigma == 0.0:
             return images
         m, others, draw = self.m, self.truth.pins, self.truth.noise.draw
@@ -154,7 +153,7 @@ class SimulatedWorld(CalibratedWorld):
     def _object(self, placed: SceneObject, stream: int, T: FloatArray) -> Look:
         """Images of an object displaced by T (4, 4) since the goal was taught."""
         s = placed.images(self.truth, T)
-        noise = self.inputs.noise_px / math.sqrt(self.inputs.averaged_frames)
+        noise = self.inputs.noise.at_rest_px
         s += noise * self.truth.noise.draw(generator(self.inputs.seed, stream), s.shape)
         return Look(s, np.full(s.shape[:2], noise) if noise > 0.0 else None)
 
@@ -180,7 +179,7 @@ class SimulatedWorld(CalibratedWorld):
         It is the same for every law; fewer instants are the first of more.
         """
         noise = np.zeros((times, len(self.view), len(numbers), 2))
-        sigma, draw = self.inputs.noise_px, self.truth.noise.draw
+        sigma, draw = self.inputs.noise.servo_px, self.truth.noise.draw
         if sigma > 0.0:
             for these, stream in ((slice(self.m), SERVO_NOISE), (slice(self.m, None), PIN_NOISE)):
                 if noise[:, :, these].size > 0:
@@ -211,7 +210,7 @@ class SimulatedWorld(CalibratedWorld):
             s[:, face + others] = ordered
             return s
 
-        points = Points(truth, see, False, self.inputs.noise_px)
+        points = Points(truth, see, False, self.inputs.noise.servo_px)
         drawn = self.inputs.seed, SERVO_NOISE
         robot: FaultyRobot = robot_of(driven.robot, q_start, points, drawn, contract.events)
         return simulated_robot(driven, self.joints, robot)
@@ -244,7 +243,7 @@ class RenderedWorld(SimulatedWorld):
     @property
     def noise_px(self) -> float:
         """Standard deviation of a coordinate of images in the loop, px."""
-        return max(self.inputs.noise_px, self.calibration.fit.sigma_fitted_px)
+        return max(self.inputs.noise.servo_px, self.calibration.fit.sigma_fitted_px)
 
     def shown(self, images: TaskImages, q_taught: FloatArray | None, seed: int) -> TaskImages:
         """Start and goal as rendered frames show them; images of the goal that are given stay as they are.
@@ -276,7 +275,7 @@ class RenderedWorld(SimulatedWorld):
     ) -> tuple[FloatArray, FloatArray]:
         """Pixels (V, b, 2) in rendered frames at joints (n,), rad or m, and their deviations (V, b)."""
         which = [scene.numbers.index(number) for number in self.numbers]
-        s, sigma = observed_in_frames(scene, self.inputs.averaged_frames, q, drawn)
+        s, sigma = observed_in_frames(scene, self.inputs.noise.averaged_frames, q, drawn)
         return np.ascontiguousarray(s[:, which]), sigma[:, which]
 
     def _with_face(self, key: str, s: FloatArray, q: FloatArray | None, q_start: FloatArray) -> FloatArray:
@@ -317,7 +316,7 @@ class RenderedWorld(SimulatedWorld):
     ) -> Look:
         """Images of an object in a scene, with the arm at joints (n,)."""
         which = [scene.numbers.index(number) for number in carrier.numbers]
-        s, sigma = observed_in_frames(scene, self.inputs.averaged_frames, q, (self.inputs.seed, stream))
+        s, sigma = observed_in_frames(scene, self.inputs.noise.averaged_frames, q, (self.inputs.seed, stream))
         return Look(s[:, which], sigma[:, which])
 
 
