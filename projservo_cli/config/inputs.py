@@ -69,19 +69,16 @@ _EXPECTED = {
     "init": "JSON with screws, cameras and markers",
     "mjcf": "a model of MuJoCo",
 }
-_REFIT = {"refit": "table", "refit readings": "readings"}  # kinds of the files of a refit, and their keys
 Files = Mapping[str, File]  # by their roles; read from disk if not given
 
 
 def calibration_inputs(config: Config, files: Files | None = None) -> CalibrationInputs | RefitInputs:
     """Return the inputs of a calibration: a table, else trials of the simulated robot; then its refits."""
-    settings, table = config.calibration, _file(config, "table", files)
+    settings, data, size = config.calibration, config.data, config.image_size_px
     source: Table | Trials
-    if config.data is not None and table is not None:
-        data = config.data
-        size = config.image_size_px
-        stated = data.joint_order == "stated"
-        readings, kind = _file(config, "readings", files), (config.joint_types, data.joint_unit)
+    if data is not None:
+        table, readings = _file("table", data.table, files), _file_if("readings", data.readings, files)
+        kind, stated = (config.joint_types, data.joint_unit), data.joint_order == "stated"
         mount = data.mount or (None if config.rig is None else config.rig.mount)
         source = Table(table, readings, *kind, size, data.noise_px, _seed(config), mount, stated)
     else:
@@ -89,18 +86,22 @@ def calibration_inputs(config: Config, files: Files | None = None) -> Calibratio
         source = _trials(config, truth_of(config, face=False), files, speed_scale=1.0)
     how = Estimation(
         settings.lens,
-        _file(config, "init", files),
+        _file_if("init", settings.init, files),
         settings.cross_validate,
         settings.max_predicted_px,
         settings.joint_model,
     )
     inputs: CalibrationInputs | RefitInputs = CalibrationInputs(source, how, settings.joint_noise)
     for i, one in enumerate(settings.refits):
-        seen, readings = (_file(config, f"{kind} {i}", files) for kind in _REFIT)
-        assert seen is not None
-        unit = one.joint_unit or (None if config.data is None else config.data.joint_unit)
-        known = config.image_size_px, settings.max_predicted_px
-        inputs = RefitInputs(inputs, one.view, seen, readings, unit, *known)
+        inputs = RefitInputs(
+            before=inputs,
+            view=one.view,
+            file=_file(f"refit {i}", one.table, files),
+            readings=_file_if(f"refit readings {i}", one.readings, files),
+            joint_unit=one.joint_unit or (None if data is None else data.joint_unit),
+            image_size=size,
+            max_predicted_px=settings.max_predicted_px,
+        )
     return inputs
 
 
@@ -373,34 +374,32 @@ def files_of(config: Config, gone: Mapping[str, str] | None = None) -> Files:
 
     gone : hashes that files had, by their paths, which stand where the files are gone.
     """
-    refits = [f"{kind} {i}" for i in range(len(config.calibration.refits)) for kind in _REFIT]
-    found = {kind: _read(config, kind, gone or {}) for kind in (*_EXPECTED, *refits)}
-    return {kind: file for kind, file in found.items() if file is not None}
-
-
-def _file(config: Config, kind: str, files: Files | None) -> File | None:
-    """The file of a kind, if the configuration names one: of ``files``, else as it is read now."""
-    return _read(config, kind, {}) if files is None else files.get(kind)
-
-
-def _read(config: Config, kind: str, gone: Mapping[str, str]) -> File | None:
-    """Read the file of a kind, if the configuration names one; an InputError where it cannot be read."""
-    rendered = config.plant.rendered is not None and config.arm is not None
-    refits = {
-        f"{name} {i}": getattr(one, key)
-        for i, one in enumerate(config.calibration.refits)
-        for name, key in _REFIT.items()
-    }
-    paths = refits | {
-        "table": config.data.table if config.data is not None else None,
-        "readings": config.data.readings if config.data is not None else None,
+    rendered = config.plant.rendered is not None
+    paths = {
+        "table": None if config.data is None else config.data.table,
+        "readings": None if config.data is None else config.data.readings,
         "init": config.calibration.init,
         "mjcf": config.arm.mjcf if config.arm is not None and rendered else None,
     }
-    if (path := paths[kind]) is None:
-        return None
-    further = files_named(path) if kind == "mjcf" else ()
-    return File.of(path, _EXPECTED.get(kind, "a table of a camera that moved"), gone.get(path, ""), further)
+    for i, one in enumerate(config.calibration.refits):
+        paths |= {f"refit {i}": one.table, f"refit readings {i}": one.readings}
+    return {role: _read(role, path, gone) for role, path in paths.items() if path is not None}
+
+
+def _file(role: str, path: str, files: Files | None) -> File:
+    """The file at a path: of ``files``, else as it is read now."""
+    return _read(role, path) if files is None else files[role]
+
+
+def _file_if(role: str, path: str | None, files: Files | None) -> File | None:
+    """The file at a path, likewise; None where the configuration names none."""
+    return None if path is None else _file(role, path, files)
+
+
+def _read(role: str, path: str, gone: Mapping[str, str] | None = None) -> File:
+    """Read the file of a role; an InputError where it cannot be read."""
+    expected = _EXPECTED.get(role, "a table of a camera that moved")
+    return File.of(path, expected, (gone or {}).get(path, ""), files_named(path) if role == "mjcf" else ())
 
 
 # Robot, rig and markers.
@@ -421,7 +420,7 @@ def scene_of(
         for name, now in (objects or {}).items()
         for tag in config.objects.named[name].placed
     ]
-    mjcf = _file(config, "mjcf", files)
+    mjcf = _file_if("mjcf", config.arm.mjcf, files)
     return described_scene(config.arm, config.rig, _markers(config), options, mjcf, tuple(tags))
 
 
