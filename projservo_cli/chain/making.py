@@ -123,7 +123,7 @@ class Chain:
             for step in self.steps
             if step.law and not step.why
         ]
-        plant = plugins.short_name(self.config.plant.use or "")
+        plant = plugins.short_name(self.config.plant.target)
         return [{"law": law, "plant": plant, "date": one.provenance.get("date")} for law, one in stored]
 
     def code(self) -> list[tuple[str, str]]:
@@ -133,9 +133,8 @@ class Chain:
         here = self.config.task is not None and self.config.task.start_joints is None
         reads = [one for one in self.steps if one.stage in ("record", "plan") and one.why]
         looks = any(_drives(step) or here for step in reads)
-        if (servo or looks) and not self.config.plant.simulated:
-            assert self.config.plant.use is not None
-            found["plant", self.config.plant.use] = None
+        if (servo or looks) and (target := self.config.plant.target):
+            found["plant", target] = None
         return list(found)
 
     def make(self) -> None:

@@ -149,7 +149,7 @@ def _sources(names: Sequence[str], config: Config, run: Run) -> dict[str, _Read]
     Where the source of a law is gone since, the stored hash stands. Another source of a robot outdates
     nothing: its motion cannot be repeated.
     """
-    plant = "" if config.plant.simulated else config.plant.use or ""
+    plant = config.plant.target
     robot = f"source of {plant}"
     found: dict[str, _Read] = {}
     for law in names:

@@ -99,13 +99,13 @@ class Steps:
         assert self.session is not None
         if not self.config.plant.simulated:
             self.opened(c)
-        if asked.act is None:
-            assert asked.wait_s is not None
+        if asked.wait_s is not None:
             self.session.hold(asked.wait_s)
             return Action("wait", f"{asked.wait_s:g} s", asked.wait_s)
-        seconds = sum(self.session.act(name, value) for name, value in asked.act.items())
-        said = ", ".join(f"{name} {value:g}" for name, value in asked.act.items())
-        nothing = any(map(self.session.empty, asked.act))
+        acts = asked.act or {}
+        seconds = sum(self.session.act(name, value) for name, value in acts.items())
+        said = ", ".join(f"{name} {value:g}" for name, value in acts.items())
+        nothing = any(map(self.session.empty, acts))
         return Action("act", said + ", which holds nothing" * nothing, seconds)
 
     def left_behind(self, part: str) -> str:

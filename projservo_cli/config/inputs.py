@@ -469,7 +469,7 @@ def _own(config: Config) -> OwnRobot:
     """The robot of somebody's."""
     plant, markers = config.plant, _markers(config)
     return OwnRobot(
-        target=plant.use or "",
+        target=plant.target,
         options=dict(plant.options),
         dictionary=markers.tag_dictionary,
         timeout_s=plant.timeout_s,

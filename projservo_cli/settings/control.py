@@ -207,6 +207,11 @@ class RobotClass(Section):
         return self.use in (None, RENDERED)
 
     @property
+    def target(self) -> str:
+        """The class of a robot of somebody's; empty for a simulated one."""
+        return "" if self.simulated else self.use or ""
+
+    @property
     def rendered(self) -> RenderedOptions | None:
         """Options of the plant mujoco; None where another one is driven."""
         return RenderedOptions.model_validate(self.options) if self.use == RENDERED else None
