@@ -83,7 +83,8 @@ def calibration_inputs(config: Config, files: Files | None = None) -> Calibratio
         source = Table(table, readings, *kind, size, data.noise_px, _seed(config), mount, stated)
     else:
         # A factor of commands to a robot that may do harm; what simulated trials show does not hang on it.
-        source = _trials(config, truth_of(config, face=False), files, speed_scale=1.0)
+        at_full_speed = {"plant": config.plant.model_copy(update={"speed_scale": 1.0})}
+        source = _trials(config.model_copy(update=at_full_speed), truth_of(config, face=False), files)
     how = Estimation(
         settings.lens,
         _file_if("init", settings.init, files),
@@ -328,15 +329,15 @@ def report_inputs(config: Config, files: Files | None = None) -> ReportInputs:
     """Return the inputs of a report: the whole configuration, which its page prints, and the extra runs."""
     files = files_of(config) if files is None else files
     about, trajectory = about_of(config, files.values()), config.trajectory
-    formats, lengths = config.report.formats, _known_lengths(config)
+    lengths = _known_lengths(config)
     if not config.has_task or config.steps:
-        return ReportInputs(about, formats, None, trajectory, lengths)
+        return ReportInputs(about, config.report, None, trajectory, lengths)
     alone = {
         "control": config.control.model_copy(update={"features": "points"}),
         "trajectory": config.trajectory.model_copy(update={"keep_out": ()}),
     }
     extra = servo_inputs(config.idealized.model_copy(update=alone), files)
-    return ReportInputs(about, formats, extra, trajectory, lengths)
+    return ReportInputs(about, config.report, extra, trajectory, lengths)
 
 
 def _known_lengths(config: Config) -> KnownLengths:
@@ -445,22 +446,19 @@ def _drive(
     config: Config,
     truth: Truth | None,
     files: Files | None = None,
-    speed_scale: float | None = None,
     *,
     shows: bool = False,
 ) -> Drive:
     """Return how a robot of the contract is driven: the simulated one of a truth, else somebody's.
 
     shows : whether cameras of a simulated one show objects, as those of somebody's do.
-    speed_scale : factor of every command; None for that of the configuration.
     """
     plant, period, robot, objects = config.plant, config.control.period_s, None, config.objects.named
     further = tuple(number for one in objects.values() for number in one.numbers)
     if truth is not None:
         faults, scene = config.disturbance.part(Faults), scene_of(config, files, objects if shows else None)
         robot = SimulatedRobot(truth, faults, scene, period, objects_of(config) if shows else ())
-    scale = plant.speed_scale if speed_scale is None else speed_scale
-    following = Following(period, scale, plant.part(ServoLimits))
+    following = Following(period, plant.speed_scale, plant.part(ServoLimits))
     endless, seen = plant.simulated and plant.joint_limits == "report", truth is None or shows
     return Drive(robot or _own(config), following, endless, further if seen else ())
 
@@ -488,13 +486,8 @@ def _seed(config: Config) -> int:
     return config.seed if config.calibration.seed is None else config.calibration.seed
 
 
-def _trials(
-    config: Config, truth: Truth | None, files: Files | None = None, speed_scale: float | None = None
-) -> Trials:
-    """Trial motions and the robot that is driven through them: the simulated one, without a truth somebody's.
-
-    speed_scale : factor of every command; None for that of the configuration.
-    """
+def _trials(config: Config, truth: Truth | None, files: Files | None = None) -> Trials:
+    """Trial motions and the robot driven through them: the simulated one of a truth, else somebody's."""
     settings, plant, reference = config.calibration, config.plant, config.reference
     if reference is None:
         raise InputError("trial motions need a reference: set calibration.reference or task.start")
@@ -515,7 +508,7 @@ def _trials(
         motions=motions,
         joints=joints_of(config, paced=driven),
         truth=truth,
-        driven=_drive(config, truth, files, speed_scale) if driven else None,
+        driven=_drive(config, truth, files) if driven else None,
         noise_px=config.noise.calibration_px,
         rest=plant.part(Rest) if driven else Rest(),
     )

@@ -311,7 +311,7 @@ def _run(
         known = run.calibration, run.observation.at_rest, plan, run.traces, lacks
         report_data = Driven(*known, held_out=run.cross_validation)
     report_data = replace(report_data, metric=metric, no_metric=no_metric)
-    figures = _draw_all(report_data, directory, inputs.formats, left_out, progress, second)
+    figures = _draw_all(report_data, directory, inputs.files.formats, left_out, progress, second)
     report = Report(
         figures=tuple(figures),
         omitted=tuple(left_out),

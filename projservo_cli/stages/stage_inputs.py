@@ -14,7 +14,15 @@ from projservo_cli.result_hashes import File, digest, encoded
 from projservo_cli.robots.contract import Bounds
 from projservo_cli.robots.joints import Joints
 from projservo_cli.settings.cameras import Cameras
-from projservo_cli.settings.control import LawSettings, Rest, RunConditions, ServoLimits, SpeedLimits, Stop
+from projservo_cli.settings.control import (
+    LawSettings,
+    ReportSettings,
+    Rest,
+    RunConditions,
+    ServoLimits,
+    SpeedLimits,
+    Stop,
+)
 from projservo_cli.settings.disturbance import EachView, Events
 from projservo_cli.settings.markers import Markers
 from projservo_cli.settings.objects import Objects
@@ -342,7 +350,7 @@ class ReportInputs:
     """Inputs of a report, except calibration, plan and runs."""
 
     about: About
-    formats: tuple[str, ...]  # of the files of each figure
+    files: ReportSettings
     extra: ServoInputs | None  # of laws by themselves on the ideal plant; None where there is no task
     trajectory: Trajectory  # requested motion of the plan
     lengths: KnownLengths
