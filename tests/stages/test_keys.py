@@ -124,12 +124,23 @@ CHANGES = [
     ("ideal", "servo", True, "plant.timeout_s=3"),
     ("ideal", "servo", True, "name=other"),
     ("ideal", "servo", False, "plant.speed_scale=0.5"),
+    ("ideal", "servo", False, "control.max_replan_attempts=5"),
+    ("ideal", "servo", False, "plant.joint_limits=stop"),
+    ("ideal", "servo", True, "plant.averaged_frames=3"),
+    ("ideal", "plan", True, "plant.joint_limits=stop"),
+    ("ideal", "plan", True, "noise.calibration_px=1"),
+    ("ideal", "plan", False, "noise.averaged_frames=3"),
+    ("ideal", "plan", True, "control.joint_acceleration_limit_deg_s2=500"),  # that of null
+    ("ideal", "calibrate", True, "noise.servo_px=1"),
     ("ideal", "report", False, "name=other"),
     ("ideal", "report", False, "control.must_converge=[]"),
     ("faults", "calibrate", True, "plant.timeout_s=3"),
     ("faults", "calibrate", True, "control.gain_t=1"),
     ("faults", "calibrate", False, "control.period_s=0.05"),
     ("faults", "calibrate", False, "plant.settle_s=1"),
+    ("faults", "calibrate", False, "plant.max_servo_lag_s=1"),
+    ("faults", "calibrate", True, "plant.speed_scale=0.5"),
+    ("faults", "calibrate", True, "plant.image_border=stop"),
     ("faults", "servo", False, "plant.timeout_s=3"),
 ]
 
