@@ -15,7 +15,7 @@ import numpy as np
 from projservo_cli.config.loading import Config, stored_yaml
 from projservo_cli.config.whole import carriers_of, truth_of
 from projservo_cli.display import About
-from projservo_cli.records import ANGLE, CORNERS, MEET, PARALLEL, PERPENDICULAR, TOOL, InputError
+from projservo_cli.records import ANGLE, MEET, PARALLEL, PERPENDICULAR, TOOL, InputError
 from projservo_cli.result_hashes import File
 from projservo_cli.settings.control import LawSettings, Rest, RunConditions, ServoLimits, SpeedLimits
 from projservo_cli.settings.disturbance import Disturbance, Events, Faults
@@ -194,7 +194,6 @@ def plan_inputs(config: Config, files: Files | None = None, *, predicted: bool =
     """
     face, markers = config.face_numbers, _markers(config)
     simulated = config.plant.simulated and not predicted
-    known = markers.known if markers.tags is not None else ()
     pairs, carriers = () if config.task is None else config.task.goal.incidences, _carriers(config, files)
     names = [one.name for one in carriers]
     displaced = _displacement(config)
@@ -209,7 +208,7 @@ def plan_inputs(config: Config, files: Files | None = None, *, predicted: bool =
         face=face,
         center=center_in_face(markers),
         known=markers.known,
-        tags=tuple(known[i : i + CORNERS] for i in range(0, len(known or ()), CORNERS)) if known else (),
+        tags=tuple(tag.numbers for tag in markers.all_tags),
         joints=joints_of(config),
         image_size=config.image_size_px,
         noise=config.noise.part(LoopNoise),
@@ -288,8 +287,7 @@ def _carriers(config: Config, files: Files | None) -> tuple[CarryingObject, ...]
 
 def _carrier(config: Config, files: Files | None, name: str, goal: GoalSettings) -> CarryingObject:
     """Return an object that a goal is carried by."""
-    rendered = config.plant.rendered is not None
-    simulated = config.plant.simulated
+    rendered, simulated = config.plant.rendered is not None, config.plant.simulated
     return CarryingObject(
         name=name,
         objects=config.objects,
@@ -328,16 +326,15 @@ def _contract(config: Config, plan: PlanInputs, files: Files | None) -> Contract
 def report_inputs(config: Config, files: Files | None = None) -> ReportInputs:
     """Return the inputs of a report: the whole configuration, which its page prints, and the extra runs."""
     files = files_of(config) if files is None else files
-    about, trajectory = about_of(config, files.values()), config.trajectory
-    lengths = _known_lengths(config)
+    about, lengths = about_of(config, files.values()), _known_lengths(config)
     if not config.has_task or config.steps:
-        return ReportInputs(about, config.report, None, trajectory, lengths)
+        return ReportInputs(about, config.report, None, config.trajectory, lengths)
     alone = {
         "control": config.control.model_copy(update={"features": "points"}),
         "trajectory": config.trajectory.model_copy(update={"keep_out": ()}),
     }
     extra = servo_inputs(config.idealized.model_copy(update=alone), files)
-    return ReportInputs(about, config.report, extra, trajectory, lengths)
+    return ReportInputs(about, config.report, extra, config.trajectory, lengths)
 
 
 def _known_lengths(config: Config) -> KnownLengths:
@@ -442,13 +439,7 @@ def joints_of(config: Config, *, paced: bool = True) -> JointSettings:
     )
 
 
-def _drive(
-    config: Config,
-    truth: Truth | None,
-    files: Files | None = None,
-    *,
-    shows: bool = False,
-) -> Drive:
+def _drive(config: Config, truth: Truth | None, files: Files | None = None, *, shows: bool = False) -> Drive:
     """Return how a robot of the contract is driven: the simulated one of a truth, else somebody's.
 
     shows : whether cameras of a simulated one show objects, as those of somebody's do.

@@ -38,6 +38,11 @@ class Tag(Section):
             yield ("pose",), what
 
     @property
+    def numbers(self) -> tuple[int, ...]:
+        """Numbers of its corners, which are markers."""
+        return tuple(CORNERS * self.number + k for k in range(CORNERS))
+
+    @property
     def corners(self) -> FloatArray:
         """Its corners (4, 3) in the frame of the tool, m, in the order in which they are detected."""
         T = np.array(self.pose)
@@ -187,7 +192,7 @@ class Markers(Section):
         if self.board is not None:
             return tuple(range(len(self.board.pattern.places)))
         if self.tags is not None:
-            return tuple(CORNERS * tag.number + k for tag in self.all_tags for k in range(CORNERS))
+            return tuple(number for tag in self.all_tags for number in tag.numbers)
         if self.numbers is None and self.positions_m is not None:
             return tuple(range(len(self.positions_m)))
         return self.numbers

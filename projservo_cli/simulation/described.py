@@ -12,7 +12,7 @@ import numpy as np
 from projservo_cli.detection import DICTIONARY
 from projservo_cli.geometry.displacements import twists
 from projservo_cli.image_size import image_sizes
-from projservo_cli.records import CORNERS, TOOL, FloatArray, no_lenses, position_limits, prismatic_of
+from projservo_cli.records import TOOL, FloatArray, no_lenses, position_limits, prismatic_of
 from projservo_cli.result_hashes import File
 from projservo_cli.settings.control import RenderedOptions
 from projservo_cli.settings.markers import Markers, Tag
@@ -132,7 +132,7 @@ def described_scene(
     mjcf : the model of the arm, None for capsules; objects : tags of objects where they stand.
     """
     assert markers.known is not None
-    further = [CORNERS * tag.number + k for tag in objects for k in range(CORNERS)]
+    further = [number for tag in objects for number in tag.numbers]
     return RenderedScene(
         arm=arm_of(robot),
         P=cameras_of(rig),
