@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from projservo_cli import plugins
 from projservo_cli.chain.making import require_simulated
-from projservo_cli.config import Config, Override, load_config, overrides_of, sweep_of, to_yaml
+from projservo_cli.config import Config, Override, checked_values, overridden, to_yaml
 from projservo_cli.config.inputs import (
     calibration_inputs,
     joints_of,
@@ -23,6 +23,7 @@ from projservo_cli.config.inputs import (
     recording_inputs,
     servo_inputs,
 )
+from projservo_cli.config.sweep import SweepConfig
 from projservo_cli.display import checked_array, numbers_in, require_radians
 from projservo_cli.experiment import Experiment, law_target, plan_scene_of
 from projservo_cli.files import working_in, writing
@@ -33,6 +34,7 @@ from projservo_cli.progress import Listener
 from projservo_cli.records import Calibration, FloatArray, InputError, JointList, Plan
 from projservo_cli.result_hashes import File
 from projservo_cli.results import ImageModel, MotionPlan, RunTrace
+from projservo_cli.settings.trials import CalibrationSettings, Data
 from projservo_cli.stages import Progress
 from projservo_cli.stages import calibrate as calibrating
 from projservo_cli.stages import plan as planning
@@ -89,9 +91,9 @@ def simulate(
     if noise_px is not None:
         if config.plant.rendered is not None:
             raise InputError("noise_px: rendered images have plant.options.grey_noise instead")
-        config = config.replace({"noise.calibration_px": noise_px})
+        config = overridden(config, [Override("simulate: noise_px", "noise.calibration_px", noise_px)])
     if seed is not None:
-        seeded = config.replace({"calibration.seed": seed})
+        seeded = overridden(config, [Override("simulate: seed", "calibration.seed", seed)])
         config, seed = (seeded, None) if q is None else (config, seed)
     with Listener(progress) as listener:
         require_simulated(config)
@@ -175,6 +177,12 @@ def record(
     )
 
 
+class _CalibrationArguments(CalibrationSettings, Data):
+    """Arguments of ``calibrate``, each a key of the section that it belongs to, of observations at hand."""
+
+    table: str = ""
+
+
 def calibrate(
     observations: Observations,
     *,
@@ -227,26 +235,26 @@ def calibrate(
     if isinstance(joint_model, str) and joint_model != "auto":
         joint_model = joint_model.split(",")
     given = {
-        "calibration.method": method,
-        "calibration.lens": lens,
-        "calibration.init": init,
-        "calibration.cross_validate": cross_validate,
-        "calibration.joint_noise_deg": joint_noise_deg,
-        "calibration.max_predicted_px": max_predicted_px,
-        "calibration.joint_model": joint_model,
-        "data.noise_px": noise_px,
-        "calibration.seed": seed,
+        "method": method,
+        "lens": lens,
+        "init": init,
+        "cross_validate": cross_validate,
+        "joint_noise_deg": joint_noise_deg,
+        "max_predicted_px": max_predicted_px,
+        "joint_model": joint_model,
+        "noise_px": noise_px,
+        "seed": seed,
     }
-    checked = load_config(None, overrides_of("calibrate", given), text="data: {table: in memory}")
-    settings = checked.calibration
+    settings = checked_values("calibrate", _CalibrationArguments, given)
     seen = observations
     if settings.joint_noise_deg is not None:
         seen = replace(seen, joint_noise=float(np.radians(settings.joint_noise_deg)))
-    if checked.data is not None and checked.data.noise_px is not None:
-        seen = replace(seen, noise_px=checked.data.noise_px)
+    if settings.noise_px is not None:
+        seen = replace(seen, noise_px=settings.noise_px)
     if settings.seed is not None:
         seen = replace(seen, seed=settings.seed)
-    file = None if settings.init is None else File.of(settings.init, "JSON with screws, cameras and markers")
+    start = None if settings.init is None else str(Path(settings.init).resolve())
+    file = None if start is None else File.of(start, "JSON with screws, cameras and markers")
     asked = Estimation(
         settings.lens,
         file,
@@ -345,7 +353,8 @@ def servo(
         factory, name, of_name = law, plugins.class_name(law), REGULATE
     if isinstance(plan, MotionPlan):
         config = _with_task(config, calibration, *plan.asked)
-    asked = config.replace({"control.mode": [of_name if mode is None else mode]})
+    modes = [of_name if mode is None else mode]
+    asked = overridden(config, [Override("servo: mode", "control.mode", modes)])
     (name,) = run_names((name,), asked.control.mode)
     if robot is not None:
         asked = _with_robot(asked, robot)
@@ -421,7 +430,7 @@ def sweep(
         "calibrations": calibrations,
         "tasks": _tasks(tasks),
     }
-    asked = sweep_of(values)
+    asked = checked_values("sweep", SweepConfig, values)
     if runs is None and asked.tasks is not None:
         asked = asked.model_copy(update={"runs": asked.tasks.count})
     design = Design(asked, ((config.name, to_yaml(config)),))
@@ -520,7 +529,7 @@ def _with_task(config: Config, calibration: Calibration, q_start: npt.ArrayLike 
         changes += [Override("plan: q_start", "task.start_offset", None)]
     if goal is not None:
         changes += [Override("plan: goal", "task.goal", _goal(config, calibration, goal))]
-    return load_config(config.name, changes, text=to_yaml(config)) if changes else config
+    return overridden(config, changes) if changes else config
 
 
 def _goal(config: Config, calibration: Calibration, goal: Any) -> Any:

@@ -12,7 +12,7 @@ import numpy as np
 from projservo_cli import plugins
 from projservo_cli.chain.making import FIGURES, Chain
 from projservo_cli.chain.outdated import STAGES
-from projservo_cli.config import Config, load_config, shipped, to_goals, to_yaml
+from projservo_cli.config import Config, load_config, overridden, shipped, to_goals
 from projservo_cli.config.inputs import joints_of
 from projservo_cli.display import Printed
 from projservo_cli.files import working_in
@@ -125,7 +125,7 @@ class Experiment(Printed):
         if not goals:
             raise InputError("servo: name a goal or several, such as servo('above', 'grip')")
         changes = to_goals(f"servo: {', '.join(goals)}", goals)
-        self._config = load_config(self.config.name, changes, text=to_yaml(self.config))
+        self._config = overridden(self.config, changes)
         return self.make("servo", laws=(law,) if law else (), blind=blind).traces
 
     def _make(

@@ -73,7 +73,7 @@ def trajectory_of(**asked):
     """A motion that is asked for, else as by default."""
     values = [f"trajectory.{key}={json.dumps(x)}" for key, x in asked.items()]
     values += ["control.mode=track"] if asked.get("keep_out") else []
-    return load_config(None, values, text="data: {table: none}").trajectory
+    return load_config(None, ["data.table=none", *values]).trajectory
 
 
 def joints_of(config, types="", calibration=None):

@@ -377,7 +377,7 @@ def _resolve(options: Mapping[str, Any], *, recording: bool = False) -> tuple["C
     A table next to the run, or the one that a ``recording`` puts there, is that of the configuration unless
     it names another.
     """
-    from projservo_cli.config import Override, load_config, to_yaml
+    from projservo_cli.config import Override, load_config, overridden
     from projservo_cli.store.run_file import stored
 
     if options.get("origin") is not None:
@@ -395,7 +395,7 @@ def _resolve(options: Mapping[str, Any], *, recording: bool = False) -> tuple["C
     table = run.path.resolve().with_name(_TRIALS)
     if config.data is None and (recording or table.is_file()):
         in_folder = Override(f"{table}", "data.table", str(table))
-        config = load_config(config.name, [in_folder], text=to_yaml(config))
+        config = overridden(config, [in_folder])
     return config, run
 
 
@@ -432,7 +432,7 @@ def _of_refit(options: Mapping[str, Any]) -> tuple["Config", "Run"]:
 
 def _from_sweep(options: Mapping[str, Any]) -> tuple["Config", "Run"]:
     """Configuration of a run of a sweep, and a run that holds the calibration it was made with."""
-    from projservo_cli.config import load_config, to_yaml
+    from projservo_cli.config import overridden
     from projservo_cli.store.run_file import Run
     from projservo_cli.sweeps.folder import run_of
 
@@ -440,7 +440,7 @@ def _from_sweep(options: Mapping[str, Any]) -> tuple["Config", "Run"]:
         raise click.UsageError("-c and --from: the configuration is that of the sweep; leave -c out")
     config, calibration = run_of(options["origin"])
     if overrides := option.overrides(options):
-        config = load_config(config.name, overrides, text=to_yaml(config))
+        config = overridden(config, overrides)
     run = _run_of(options, config)
     before = run.results.get("calibrate")
     if calibration is not None and (before is None or before.key != calibration.key):

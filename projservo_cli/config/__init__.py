@@ -3,13 +3,14 @@
 from projservo_cli.config.loading import (
     Config,
     Override,
+    checked_values,
     load_config,
     load_sweep,
+    overridden,
     overrides_of,
     plain_yaml,
     shipped,
     stored_yaml,
-    sweep_of,
     to_goals,
     to_yaml,
 )
@@ -17,13 +18,14 @@ from projservo_cli.config.loading import (
 __all__ = [
     "Config",
     "Override",
+    "checked_values",
     "load_config",
     "load_sweep",
+    "overridden",
     "overrides_of",
     "plain_yaml",
     "shipped",
     "stored_yaml",
-    "sweep_of",
     "to_goals",
     "to_yaml",
 ]

@@ -28,7 +28,7 @@ from projservo_cli.files import bytes_of, text_of
 from projservo_cli.passwords import masked
 from projservo_cli.records import FloatArray, InputError
 from projservo_cli.settings.control import RENDERED, RenderedOptions
-from projservo_cli.settings.sections import CONTRADICTIONS, Note, Root
+from projservo_cli.settings.sections import CONTRADICTIONS, Note, Section
 from projservo_cli.settings.task import CURRENT
 from projservo_cli.simulation.described import arm_of
 from projservo_cli.simulation.mjcf import read_mjcf
@@ -80,7 +80,7 @@ _MAX_VALUES = 50_000  # aliases counted as often as they are used
 _MAX_DEPTH = 32
 _MOST_LINES = 50  # of error messages
 _STANDARD = "tag:yaml.org,2002:"
-_Model = TypeVar("_Model", bound=Root)
+_Model = TypeVar("_Model", bound=Section)
 
 
 def _shortened(text: str, max_length: int = 80) -> str:
@@ -136,6 +136,13 @@ class _Document:
     def read(cls, path: pathlib.Path | str) -> "_Document":
         """The document in a file; an InputError where there is none."""
         return cls(text_of(path, "a configuration (YAML)", _MAX_BYTES), str(path))
+
+    @classmethod
+    def of(cls, values: Any, name: str) -> "_Document":
+        """The document of values at hand, which messages call by a name."""
+        document = cls("", name)
+        document.values = plain(values)
+        return document
 
     def _place(self, mark: yaml.Mark) -> str:
         return f"{self.name}:{mark.line + 1}:{mark.column + 1}"
@@ -310,7 +317,7 @@ class Config(Settings):
         InputError
             With a line for each value that does not fit.
         """
-        return load_config(None, values=values)
+        return _configured(_Document.of(values, "values"))
 
     def __str__(self) -> str:
         """The values that differ from their defaults, as YAML."""
@@ -331,7 +338,7 @@ class Config(Settings):
         InputError
             With a line for each value that does not fit, as for ``--set``.
         """
-        return load_config(self.name, overrides_of("replace", values), text=to_yaml(self))
+        return overridden(self, overrides_of("replace", values))
 
     def pose(self, q: npt.ArrayLike) -> FloatArray:
         """Return the true pose of the simulated arm's tool in its base frame, before any calibration.
@@ -382,7 +389,6 @@ def load_config(
     overrides: Sequence[str | Override] = (),
     *,
     text: str | None = None,
-    values: Mapping[str, Any] | None = None,
     teaching: bool = False,
 ) -> Config:
     """Read and check a configuration; paths in it become absolute.
@@ -390,17 +396,30 @@ def load_config(
     path : the YAML file; None for a blank recorded configuration, which overrides fill.
     overrides : ``a.b=v`` as for ``--set``, applied in order.
     text : its content, where it is already at hand; ``path`` then only names it in messages.
-    values : the plain values themselves, where there is no text.
     teaching : a goal or a start whose file does not exist yet is still to be taught, and left out.
     Raises InputError, one line ``file:line:column: key: message`` for each error.
     """
-    changes = [change if isinstance(change, Override) else Override.parse(change) for change in overrides]
     if path is not None and text is None:
         document = _Document.read(path)
     else:
-        document = _Document(text or "", "values" if values is not None else str(path or ""))
-    if values is not None:
-        document.values = plain(values)
+        document = _Document(text or "", str(path or ""))
+    return _configured(document, overrides, path, teaching=teaching)
+
+
+def overridden(config: Config, overrides: Sequence[str | Override]) -> Config:
+    """Return a configuration with other values, checked as a whole; raises InputError as ``load_config``."""
+    return _configured(_Document.of(_without_unset(config), config.name), overrides)
+
+
+def _configured(
+    document: _Document,
+    overrides: Sequence[str | Override] = (),
+    path: pathlib.Path | str | None = None,
+    *,
+    teaching: bool = False,
+) -> Config:
+    """The configuration of a document, with overrides; paths of files start at the folder of ``path``."""
+    changes = [change if isinstance(change, Override) else Override.parse(change) for change in overrides]
     if document.values is None:
         document.values = {}
     if not isinstance(document.values, dict):
@@ -478,19 +497,17 @@ def load_sweep(path: pathlib.Path | str, overrides: Sequence[str] = ()) -> Sweep
     return sweep.model_copy(update={"base": base})
 
 
-def sweep_of(values: Mapping[str, Any]) -> SweepConfig:
-    """Check the configuration of a sweep that is at hand; an InputError as for one in a file."""
-    document = _Document("", "sweep")
-    document.values = plain(values)
-    return _validated(SweepConfig, document)
+def checked_values(what: str, model: type[_Model], values: Mapping[str, Any]) -> _Model:
+    """Check values at hand by a section, or a sweep; an InputError with lines ``what: key: message``."""
+    return _validated(model, _Document.of(values, what))
 
 
 def _validated(model: type[_Model], document: _Document) -> _Model:
-    """The configuration that a document holds; an InputError with all that is wrong with it."""
+    """What a document holds; an InputError with all that is wrong with it."""
     wrong: list[ErrorDetails] = []
     try:
         if all(path for path, *_ in document.problems):  # of a text that is none, no more can be said
-            config = model.model_validate(document.values)
+            held = model.model_validate(document.values)
     except ValidationError as error:
         wrong = error.errors(include_url=False)
     if broken := {part["loc"][0] for part in wrong if part["loc"]}:
@@ -504,7 +521,7 @@ def _validated(model: type[_Model], document: _Document) -> _Model:
         document.wrong(path, what)
     if document.problems:
         raise document.refused()
-    return config
+    return held
 
 
 def to_yaml(config: Config) -> str:

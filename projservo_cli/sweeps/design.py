@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from projservo_cli.config import Config, Override, load_config, to_yaml
+from projservo_cli.config import Config, Override, load_config, overridden, to_yaml
 from projservo_cli.config.inputs import calibration_inputs
 from projservo_cli.config.sweep import BASE, LAW, Distribution, SweepConfig
 from projservo_cli.config.whole import truth_of
@@ -28,19 +28,7 @@ from projservo_cli.store.sweep_table import values_in
 
 def _changed(config: Config, values: Mapping[str, Any], what: str) -> Config:
     """A configuration with other values, or an InputError with their origin."""
-    resolved = config.model_dump(mode="json")
-    changes = [_override(what, key, value) for key, value in values.items()]
-    try:
-        for change in changes:
-            *above, last = change.path
-            section: Any = resolved
-            for step in above:
-                section = section[step]
-            section[last] = change.value
-        return Config.model_validate(resolved)
-    except (ValueError, KeyError, IndexError, TypeError):
-        load_config(config.name, changes, text=to_yaml(config))  # reports errors in the user's words
-        raise
+    return overridden(config, [_override(what, key, value) for key, value in values.items()])
 
 
 def _override(what: str, key: str, value: Any) -> Override:
@@ -267,7 +255,7 @@ class Design:
         task, _ = _motion_of(where, config)
         given = task.model_dump(mode="json", exclude_defaults=True) | self.sweep.listed_tasks[number]
         change = Override(where, "task", given)
-        found, _ = _motion_of(where, load_config(config.name, [change], text=to_yaml(config)))
+        found, _ = _motion_of(where, overridden(config, [change]))
         return found
 
     def config(self, run: int) -> Config:

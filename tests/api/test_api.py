@@ -336,7 +336,15 @@ REFUSED = [
     (lambda c, k, p: ps.simulate(c, "here"), r"q: no array of numbers; expected shape \(K, 6\), rad or m"),
     (lambda c, k, p: ps.simulate("ur5"), "simulate: config of type str: read one with Config.load"),
     (lambda c, k, p: ps.calibrate(np.zeros(3)), "observations of type ndarray; make them with"),
-    (lambda c, k, p: ps.calibrate(ps.simulate(c), method="best"), "method: 'best' is not one of them"),
+    (
+        lambda c, k, p: ps.simulate(c, noise_px=-1),
+        "^simulate: noise_px: noise.calibration_px: must be",
+    ),
+    (
+        lambda c, k, p: ps.calibrate(ps.simulate(c), method="best", noise_px=0, lens="no"),
+        "^calibrate: noise_px: must be greater than 0, not 0\ncalibrate: method: 'best' is not one of .*\n"
+        "calibrate: lens: .*, not 'no'$",
+    ),
     (lambda c, k, p: ps.Experiment(c).plan, r"holds no result of plan; make it first: make\('plan'\)"),
     (lambda c, k, p: ps.Experiment(c).make("report"), "give Experiment a path"),
     (lambda c, k, p: ps.Experiment(c).make("prepare"), "no such stage; stages: calibrate, plan, servo, rep"),
@@ -353,7 +361,7 @@ REFUSED = [
     (lambda c, k, p: ps.servo(c, k, p, law="exakt"), "law exakt: no such law; laws: direct_three"),
     (lambda c, k, p: ps.servo(c, k, p, law=3), "law 3: expected a name, or a class or function"),
     (lambda c, k, p: ps.sweep(c, laws=[3]), "law 3: expected a name, or a class or function that makes"),
-    (lambda c, k, p: ps.servo(c, k, p, mode="follow"), "'follow' is not one of them; valid: regulate"),
+    (lambda c, k, p: ps.servo(c, k, p, mode="follow"), "^servo: mode: .* 'follow' is not one of them; valid"),
     (
         lambda c, k, p: ps.servo(c, k, p, law="stacked", mode="track"),
         "^control.mode track: stacked has no such mode, only regulate and image_track; laws that have",

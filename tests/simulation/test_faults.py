@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from projservo_cli.config import load_config, plain_yaml
+from projservo_cli.config import Config
 from projservo_cli.records import no_lenses, position_limits
 from projservo_cli.simulation.arm import SerialArm
 from projservo_cli.simulation.faults import FaultyRobot, Points, World, full_reach
@@ -42,7 +42,7 @@ def images(q, M=M):
 def robot(sigma_px=0.0, seed=1, q_start=(0.0, 0.0), **disturbance):
     truth = Truth(arm(), CAMERAS, M, (0, 1, 2), (), 0, np.full((2, 2), math.inf), no_lenses(2))
     world = World(truth, np.array(q_start), Points(truth, truth.images, True, sigma_px), PERIOD, seed, 0)
-    config = load_config(None, text=plain_yaml({"data": {"table": "none"}, "disturbance": disturbance}))
+    config = Config.from_dict({"data": {"table": "none"}, "disturbance": disturbance})
     return FaultyRobot(world, config.disturbance, config.disturbance)
 
 
