@@ -9,7 +9,7 @@ from pydantic import BeforeValidator, Field
 
 from projservo_cli.config.whole import FolderName
 from projservo_cli.settings.control import Plain, one_or_more
-from projservo_cli.settings.sections import Count, Note, Number, Positive, Root, Section, Whole
+from projservo_cli.settings.sections import Count, Note, Number, OneOf, Positive, Root, Section, Whole
 
 BASE, LAW = "base", "law"  # names of axes with a special meaning
 
@@ -46,9 +46,10 @@ _Axis = Annotated[_Linked, BeforeValidator(_axis, json_schema_input_type=_Given)
 _Bases = Annotated[tuple[str, ...], Field(min_length=1)]
 
 
-class Distribution(Section):
+class Distribution(OneOf):
     """Distribution of a value: exactly one of the four."""
 
+    one_of = ("uniform", "log_uniform", "normal", "choice")
     uniform: tuple[Number, Number] | None = Field(
         None, description="minimum and maximum of a uniform distribution"
     )
@@ -60,19 +61,17 @@ class Distribution(Section):
     )
     choice: tuple[Plain, ...] | None = Field(None, min_length=1, description="values of equal probability")
 
-    def contradictions(self) -> Iterator[Note]:
-        """None of the four or several, or bounds upside down."""
-        given = [(name, value) for name, value in self if value is not None]
-        if len(given) != 1:
-            yield (), "give exactly one of uniform, log_uniform, normal and choice"
-        for name, value in given:
-            if name in ("uniform", "log_uniform") and not value[0] < value[1]:
-                yield (), f"{name} needs a minimum below the maximum"
+    def of_kind(self) -> Iterator[Note]:
+        """Bounds upside down."""
+        bounds = self.uniform or self.log_uniform
+        if bounds is not None and not bounds[0] < bounds[1]:
+            yield (), f"{self.kind} needs a minimum below the maximum"
 
 
-class _Tasks(Section):
+class _Tasks(OneOf):
     """Tasks instead of that of the base, which the runs of a cell take in turn."""
 
+    one_of = ("random", "listed")
     random: Count | None = Field(
         None, description="number of random tasks, which the runs of a cell take in turn"
     )
@@ -92,8 +91,7 @@ class _Tasks(Section):
 
     def contradictions(self) -> Iterator[Note]:
         """Random and listed tasks, or none; rotations that are no range."""
-        if (self.random is None) == (self.listed is None):
-            yield (), "give exactly one of random and listed"
+        yield from super().contradictions()
         if not 0.0 <= self.rotation_deg[0] < self.rotation_deg[1] <= 180.0:
             yield ("rotation_deg",), "needs a minimum below the maximum, both within 0 and 180"
 

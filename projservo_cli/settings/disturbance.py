@@ -14,6 +14,7 @@ from projservo_cli.settings.sections import (
     Note,
     NotNegative,
     Number,
+    OneOf,
     Positive,
     Section,
     Vector3,
@@ -31,9 +32,10 @@ class LostMarkers(Section):
     )
 
 
-class JointMoved(Section):
+class JointMoved(OneOf):
     """A joint that is displaced, or slips on its encoder."""
 
+    one_of = ("by_deg", "by_m")
     at_step: Count = Field(description="step at which the joint moves")
     joint: Count = Field(description="number of the joint, from 1")
     by_deg: Number | None = Field(None, description="angle of a revolute joint")
@@ -41,11 +43,6 @@ class JointMoved(Section):
     encoder_slip: StrictBool = Field(
         False, description="whether the link slips on its encoder, so that the reading stays the same"
     )
-
-    def contradictions(self) -> Iterator[Note]:
-        """An angle and a distance, or neither."""
-        if (self.by_deg is None) == (self.by_m is None):
-            yield (), "give exactly one of by_deg and by_m"
 
     @property
     def by(self) -> float:

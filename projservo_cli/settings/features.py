@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BeforeValidator, Field, WithJsonSchema
 
 from projservo_cli.records import KINDS, MEET, PARALLEL, PERPENDICULAR
-from projservo_cli.settings.sections import Note, Number, Section, Whole
+from projservo_cli.settings.sections import Note, Number, OneOf, Whole
 
 _TOOL, _SCENE = "tool", "scene"
 _RELATIONS = (MEET, PARALLEL, PERPENDICULAR)
@@ -52,9 +52,10 @@ _Line = Annotated[tuple[Whole, ...], Field(min_length=2, max_length=2)]
 _Plane = Annotated[tuple[Whole, ...], Field(min_length=3, max_length=3)]
 
 
-class Feature(Section):
+class Feature(OneOf):
     """A point, line or plane of the tool or an object through its markers, or where that of the tool was."""
 
+    one_of = KINDS
     on: Name = Field(
         description="what the feature moves with: tool, scene, which stands still, or the name of an object"
     )
@@ -70,23 +71,14 @@ class Feature(Section):
         None, description="numbers of three markers, in the sense of the plane; or as for a point"
     )
 
-    def contradictions(self) -> Iterator[Note]:
-        """No kind or several, markers of the scene, and a tool that names another feature."""
-        kinds = self.given(*KINDS)
-        if len(kinds) != 1:
-            yield (), f"give exactly one of {', '.join(KINDS)}"
-            return
+    def of_kind(self) -> Iterator[Note]:
+        """Markers of the scene or twice the same, and a tool that names another feature."""
         if self.on == _TOOL and isinstance(self.source, str):
-            yield (kinds[0],), "of the tool are numbers of its markers; a name stands for one of the scene"
+            yield (self.kind,), "of the tool are numbers of its markers; a name stands for one of the scene"
         if self.on == _SCENE and not isinstance(self.source, str):
-            yield (kinds[0],), "of the scene is the name of a feature of the tool that was there when taught"
+            yield (self.kind,), "of the scene is the name of a feature of the tool that was there when taught"
         if isinstance(self.source, tuple) and len(set(self.source)) < len(self.source):
-            yield (kinds[0],), "a marker stands here twice"
-
-    @property
-    def kind(self) -> str:
-        """Return whether it is a point, a line or a plane."""
-        return self.given(*KINDS)[0]
+            yield (self.kind,), "a marker stands here twice"
 
     @property
     def source(self) -> tuple[int, ...] | str:

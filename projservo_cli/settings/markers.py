@@ -77,9 +77,8 @@ class BoardSettings(Section):
 
     def contradictions(self) -> Iterator[Note]:
         """Tags of a board without."""
-        for key in ("dictionary", "first"):
-            if self.kind == "chessboard" and getattr(self, key) is not None:
-                yield (key,), "is of the tags on a board of kind charuco, and a chessboard has none"
+        for key in self.given("dictionary", "first") if self.kind == "chessboard" else ():
+            yield (key,), "is of the tags on a board of kind charuco, and a chessboard has none"
 
 
 def _tag(number: int, size_m: float, R: Rotation, t: Sequence[float]) -> Tag:
@@ -121,6 +120,9 @@ _Center = Annotated[
     PlainValidator(_center),
     WithJsonSchema({"anyOf": [{"const": "midpoint", "type": "string"}, {"type": "integer", "minimum": 0}]}),
 ]
+
+
+_BARE = ("positions_m", "numbers")  # keys of markers that are no corners
 
 
 class Markers(Section):
@@ -231,12 +233,9 @@ class Markers(Section):
 
     def contradictions(self) -> Iterator[Note]:
         """Markers said twice; numbers that are missing, strange or given twice."""
-        for key in ("positions_m", "numbers") if self.tags is not None else ():
-            if getattr(self, key) is not None:
-                yield (key,), "tags is set as well, whose corners are the markers; keep one"
-        for key in ("positions_m", "numbers", "tags", "tag_size_m") if self.board is not None else ():
-            if getattr(self, key) is not None:
-                yield (key,), "board is set as well, whose corners are the markers; keep one"
+        for whole, others in (("tags", _BARE), ("board", (*_BARE, "tags", "tag_size_m"))):
+            for key in self.given(*others) if self.given(whole) else ():
+                yield (key,), f"{whole} is set as well, whose corners are the markers; keep one"
         if self.board is not None and self.dictionary is not None:
             yield ("dictionary",), "is of tags: that of the board is board.dictionary"
         numbers = [tag.number for tag in self.all_tags]

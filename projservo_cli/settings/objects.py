@@ -11,7 +11,7 @@ from projservo_cli.geometry.displacements import rigid
 from projservo_cli.records import CORNERS, FloatArray
 from projservo_cli.settings.features import is_name
 from projservo_cli.settings.markers import Tag
-from projservo_cli.settings.sections import Note, Positive, Section, Vector3, Whole
+from projservo_cli.settings.sections import Note, OneOf, Positive, Section, Vector3, Whole
 
 WORLD_AND_TOOL = ("scene", "tool")
 """What a feature moves with besides objects, whose names they cannot be."""
@@ -38,9 +38,10 @@ class Displacement(Section):
         return rigid(R, middle - R.apply(middle) + self.translation_m)
 
 
-class ObjectSettings(Section):
+class ObjectSettings(OneOf):
     """Markers of an object, and where it is in a simulation."""
 
+    one_of = ("tags", "markers")
     tags: Annotated[
         tuple[Whole, ...] | tuple[Tag, ...] | None, Field(max_length=250), BeforeValidator(_of_one_kind)
     ] = Field(
@@ -93,16 +94,13 @@ class ObjectSettings(Section):
         assert self.points is not None
         return self.displacement.about(self.points[:, :3].mean(axis=0))
 
-    def contradictions(self) -> Iterator[Note]:
-        """No markers, too few or the same twice, and places of others than these."""
-        if len(self.given("tags", "markers")) != 1:
-            yield (), "give exactly one of tags and markers"
-            return
-        (key,) = self.given("tags", "markers")
+    def of_kind(self) -> Iterator[Note]:
+        """Too few markers or the same twice, and places of others than these."""
         if len({*self.numbers}) < len(self.numbers):
-            yield (key,), "a number stands here twice"
+            yield (self.kind,), "a number stands here twice"
         if len(self.numbers) < _LEAST:
-            yield (key,), f"{len(self.numbers)} markers do not show how it is turned: name {_LEAST} or more"
+            what = f"{len(self.numbers)} markers do not show how it is turned: name {_LEAST} or more"
+            yield (self.kind,), what
         elif self.positions_m is not None and len(self.positions_m) != len(self.numbers):
             yield ("positions_m",), f"{len(self.positions_m)} positions_m for {len(self.numbers)} markers"
 

@@ -16,6 +16,7 @@ from projservo_cli.settings.sections import (
     Note,
     NotNegative,
     Number,
+    OneOf,
     Positive,
     Section,
     Sizes,
@@ -133,9 +134,10 @@ class _Screws(Section):
             yield ("base_tool",), what
 
 
-class LimitSettings(Section):
+class LimitSettings(OneOf):
     """Joint limits of a robot without kinematics in the configuration."""
 
+    one_of = ("joints", "from_data")
     joints: Annotated[tuple[Vector2, ...], Field(min_length=1, max_length=64)] | None = Field(
         None, description="minimum and maximum reading of each joint, base to tool"
     )
@@ -148,8 +150,7 @@ class LimitSettings(Section):
 
     def contradictions(self) -> Iterator[Note]:
         """Two ways to say them or none, a unit too many or too few, or limits upside down."""
-        if (self.joints is None) == (self.from_data is None):
-            yield (), "give exactly one of joints and from_data"
+        yield from super().contradictions()
         if (self.joints is None) != (self.unit is None):
             yield ("unit",), "is that of joints: give both or neither"
         for i, (low, high) in enumerate(self.joints or ()):

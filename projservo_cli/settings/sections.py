@@ -3,7 +3,7 @@
 import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import Annotated, Any, Literal, Self, TypeVar, cast
+from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar, cast
 
 import numpy as np
 from pydantic import (
@@ -91,6 +91,30 @@ class Section(BaseModel):
     def part(self, kind: type[_Part]) -> _Part:
         """Return the values that a section declares from which this one inherits."""
         return cast(_Part, kind.model_construct(**{name: getattr(self, name) for name in kind.model_fields}))
+
+
+class OneOf(Section):
+    """A section that gives exactly one of some keys, which is its kind."""
+
+    one_of: ClassVar[tuple[str, ...]]
+
+    @property
+    def kind(self) -> str:
+        """Return the key that it gives."""
+        return self.given(*self.one_of)[0]
+
+    def contradictions(self) -> Iterator[Note]:
+        """Yield that none of the keys is given, or several; else what contradicts the one that is."""
+        given = self.given(*self.one_of)
+        if len(given) != 1:
+            keys = f"{', '.join(self.one_of[:-1])} and {self.one_of[-1]}"
+            yield (), f"give exactly one of {keys}; given: {', '.join(given) or 'none'}"
+        else:
+            yield from self.of_kind()
+
+    def of_kind(self) -> Iterable[Note]:
+        """Yield the contradictions of a section that gives one of the keys."""
+        return ()
 
 
 def is_view(name: str) -> bool:

@@ -26,6 +26,7 @@ from projservo_cli.settings.sections import (
     Note,
     NotNegative,
     Number,
+    OneOf,
     Positive,
     Section,
     Vector2,
@@ -155,9 +156,10 @@ class _ObjectImages(Section):
         return (self.model_extra or {}).get(name)
 
 
-class DisplacedAlong(Section):
+class DisplacedAlong(OneOf):
     """A displacement back along a line, or from a plane along its normal, to the side that cameras see."""
 
+    one_of = ("by_m", "by_px")
     along: Name = Field(description="name of a line or plane, where it is at the pose that is displaced")
     by_m: Number | None = Field(None, description="length; below 0 the other way; needs a known length")
     by_px: Number | None = Field(
@@ -165,13 +167,10 @@ class DisplacedAlong(Section):
         description="mean motion of the markers in the image in which they move most; below 0 the other way",
     )
 
-    def contradictions(self) -> Iterator[Note]:
-        """No amount, both, or none to speak of."""
-        kinds = self.given("by_m", "by_px")
-        if len(kinds) != 1:
-            yield (), "give exactly one of by_m and by_px"
-        elif getattr(self, kinds[0]) == 0.0:
-            yield (kinds[0],), "must not be 0"
+    def of_kind(self) -> Iterator[Note]:
+        """No amount to speak of."""
+        if getattr(self, self.kind) == 0.0:
+            yield (self.kind,), "must not be 0"
 
     def misplaced(self, features: Mapping[str, Feature]) -> str:
         """Return the reason why it is along none of these features; empty if it is along one."""
@@ -186,9 +185,10 @@ class DisplacedAlong(Section):
         return ""
 
 
-class Goal(Section):
+class Goal(OneOf):
     """The goal: joint readings, a rotation about the roll axis of the rig, or images of the face."""
 
+    one_of = ("joints", "roll_deg", "images")
     joints: JointVector | None = Field(None, description="joint readings at the goal")
     roll_deg: Number | None = Field(
         None, ge=-360, le=360, description="rotation from the start about the roll axis of the rig"
@@ -219,14 +219,12 @@ class Goal(Section):
     @property
     def of_start(self) -> bool:
         """Whether it is the start, displaced."""
-        return self.displaced is not None and not self.given("joints", "roll_deg", "images")
+        return self.displaced is not None and not self.given(*self.one_of)
 
     def contradictions(self) -> Iterator[Note]:
-        """No goal, or several."""
-        kinds = self.given("joints", "roll_deg", "images")
-        if len(kinds) != 1 and not self.of_start:
-            given = f", not {' and '.join(kinds)}" if kinds else ""
-            yield (), f"give exactly one of joints, roll_deg and images{given}"
+        """No goal, or several; a perturbation of another one than by a rotation."""
+        if not self.of_start:
+            yield from super().contradictions()
         if self.perturbation is not None and self.roll_deg is None:
             yield ("perturbation",), "belongs to a goal given by roll_deg"
 
@@ -237,12 +235,10 @@ class _Approach(DisplacedAlong):
     to: Name = Field(description="name of the goal that is displaced")
 
 
-_KINDS_OF_STEPS = ("to", "approach", "retreat", "act", "wait_s")
-
-
-class TaskStep(Section):
+class TaskStep(OneOf):
     """One step of a sequence: a motion, an action of the robot, or a time to wait."""
 
+    one_of = ("to", "approach", "retreat", "act", "wait_s")
     to: Name | None = Field(None, description="name of the goal to go to")
     approach: _Approach | None = Field(None, description="go to a goal displaced along a feature")
     retreat: DisplacedAlong | None = Field(
@@ -258,17 +254,10 @@ class TaskStep(Section):
         None, description="of a motion, such as one into contact; null: trajectory.duration_s"
     )
 
-    def contradictions(self) -> Iterator[Note]:
-        """No kind of step, or several."""
-        if len(self.given(*_KINDS_OF_STEPS)) != 1:
-            yield (), f"give exactly one of {', '.join(_KINDS_OF_STEPS)}"
-        elif self.duration_s is not None and not self.moves:
+    def of_kind(self) -> Iterator[Note]:
+        """A duration of what is no motion."""
+        if self.duration_s is not None and not self.moves:
             yield ("duration_s",), "is of a motion: to, approach or retreat; the robot class times an action"
-
-    @property
-    def kind(self) -> str:
-        """Return its kind by the key that it gives."""
-        return self.given(*_KINDS_OF_STEPS)[0].removesuffix("_s")
 
     @property
     def moves(self) -> bool:
@@ -285,7 +274,7 @@ class TaskStep(Section):
         """Name of the step, which others may have too."""
         if self.act is not None:
             return "_".join(self.act)
-        return self.to or "_".join(filter(None, (self.kind, self.goal)))
+        return self.to or "_".join(filter(None, (self.kind.removesuffix("_s"), self.goal)))
 
 
 CURRENT = "current"
