@@ -24,8 +24,8 @@ def kind(schema: dict[str, Any], sections: Mapping[str, list[str]]) -> str:
     if "$ref" in schema:
         name = named(schema)
         return f"[keys](#{anchor(heading(sections[name]))})" if name in sections else "any keys"
-    if "anyOf" in schema:
-        return " or ".join(kind(part, sections) for part in schema["anyOf"])
+    if kinds := schema.get("anyOf") or schema.get("oneOf"):
+        return " or ".join(kind(part, sections) for part in kinds)
     if "enum" in schema:
         return ", ".join(f"`{value}`" for value in schema["enum"])
     if "const" in schema:

@@ -63,7 +63,7 @@ _PHRASES = {
 }
 
 # Parts of a position that pydantic adds for each kind that a value may be of.
-_KIND = re.compile(r"constrained-\w+|(literal|tuple)\[.*")
+_KIND = re.compile(r"constrained-\w+|float|(literal|tuple)\[.*")
 
 # Values that name files, relative to the configuration.
 _FILES = (
@@ -748,7 +748,8 @@ def _words(error: ErrorDetails) -> list[str]:
 
 def _requirement(error: ErrorDetails) -> str:
     """Say what a value does not meet."""
-    return _PHRASES.get(error["type"], error["msg"]).format(**error.get("ctx", {}))
+    phrase = _PHRASES.get(error["type"])
+    return error["msg"] if phrase is None else phrase.format(**error.get("ctx", {}))
 
 
 def _phrase(model: type[BaseModel], error: ErrorDetails) -> str:

@@ -115,8 +115,6 @@ def _images_of(
         return
     numbers = images.markers or markers.front
     yield from markers.unknown(images.markers or (), *path, "markers")
-    if len(set(numbers)) < len(numbers):
-        yield (*path, "markers"), "a number stands here twice"
     counts = Counter[int]()  # of cameras that see each marker
     for key in (*images.view, *map(sigma_key, images.view)):
         given = images.side(key)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from projservo_cli.detection import LEAST_ROWS, Board
 from projservo_cli.records import CORNERS, FloatArray
-from projservo_cli.settings.sections import Matrix44, Note, Positive, Section, Vector3, Whole, not_rigid
+from projservo_cli.settings.sections import Note, Pose, Positive, Section, Vector3, Whole
 
 GROUND = 4.0 / 3.0
 """Width of a tag of six cells with a bright margin of one cell, over that without."""
@@ -27,15 +27,10 @@ class Tag(Section):
         description="number of the tag t in its dictionary; its corners are markers 4 t to 4 t + 3"
     )
     size_m: Positive = Field(description="side of the black square")
-    pose: Matrix44 = Field(
+    pose: Pose = Field(
         description="pose in the frame of the tool, or for an object of the base, m: the tag faces along z, "
         "y is up on it"
     )
-
-    def contradictions(self) -> Iterator[Note]:
-        """A tag that is nowhere."""
-        if what := not_rigid(self.pose):
-            yield ("pose",), what
 
     @property
     def numbers(self) -> tuple[int, ...]:

@@ -4,7 +4,8 @@ from collections.abc import Iterator, Mapping
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BeforeValidator, ConfigDict, Field
+from pydantic import ConfigDict, Discriminator, Field
+from pydantic import Tag as Kind
 from scipy.spatial.transform import Rotation
 
 from projservo_cli.geometry.displacements import rigid
@@ -18,12 +19,27 @@ WORLD_AND_TOOL = ("scene", "tool")
 _LEAST = 3  # markers that show how an object is turned
 
 
-def _of_one_kind(value: Any) -> Any:
-    """Numbers of tags, or tags with their places; else ValueError, in one line."""
-    kinds = {isinstance(one, (dict, Tag)) for one in value} if isinstance(value, (list, tuple)) else set()
-    if len(kinds) != 1 or not all(isinstance(one, (dict, Tag)) or type(one) is int for one in value):
-        raise ValueError("must be numbers of tags, or {number, size_m, pose} of each where it is simulated")
-    return value
+_NUMBERS, _PLACED = "tuple[int]", "tuple[Tag]"  # as pydantic calls kinds of lists, which messages leave out
+
+
+def _kind(tags: Any) -> str | None:
+    """Which of both kinds of lists some tags are; None for anything else."""
+    each = tags if isinstance(tags, (list, tuple)) else ()
+    if each and all(isinstance(one, (dict, Tag)) for one in each):
+        return _PLACED
+    return _NUMBERS if each and all(type(one) is int for one in each) else None
+
+
+_Tags = Annotated[
+    Annotated[tuple[Whole, ...], Kind(_NUMBERS)] | Annotated[tuple[Tag, ...], Kind(_PLACED)],
+    Discriminator(
+        _kind,
+        custom_error_type="tags",
+        custom_error_message="must be numbers of tags, or {number, size_m, pose} of each where it is "
+        "simulated",
+    ),
+    Field(max_length=250),
+]
 
 
 class Displacement(Section):
@@ -42,9 +58,7 @@ class ObjectSettings(OneOf):
     """Markers of an object, and where it is in a simulation."""
 
     one_of = ("tags", "markers")
-    tags: Annotated[
-        tuple[Whole, ...] | tuple[Tag, ...] | None, Field(max_length=250), BeforeValidator(_of_one_kind)
-    ] = Field(
+    tags: _Tags | None = Field(
         None,
         description="numbers of its tags; in a simulation {number, size_m, pose} of each, the pose in the "
         "base frame when the goal was taught",

@@ -11,23 +11,23 @@ from projservo_cli.records import TWO_TURNS, VIEWS
 from projservo_cli.settings.sections import (
     ByView,
     JointVector,
+    Limits,
     Matrix34,
-    Matrix44,
     Note,
     NotNegative,
     Number,
     OneOf,
+    Pose,
     Positive,
     Section,
     Sizes,
     Vector2,
     Vector3,
     not_a_screw,
-    not_rigid,
 )
 
 _File = Annotated[str, StringConstraints(min_length=1)]
-_IDENTITY: Matrix44 = (
+_IDENTITY: Pose = (
     (1.0, 0.0, 0.0, 0.0),
     (0.0, 1.0, 0.0, 0.0),
     (0.0, 0.0, 1.0, 0.0),
@@ -43,19 +43,14 @@ def like_degrees(low: float, high: float) -> str:
     return f"{low:g} to {high:g} rad is more than two turns to a side: degrees?" if alike else ""
 
 
-def _upside_down(low: float, high: float) -> str:
-    """Return the reason why two limits are none; empty if they are some."""
-    return "" if low < high else f"the lower limit {low:g} must be below the upper limit {high:g}"
-
-
 class _Joint(Section):
     """Common keys of joints: a type, optional name and limits."""
 
     type: Literal["R", "P"] = Field(description="R: revolute, P: prismatic")
     name: str | None = Field(None, description="name in messages and figures")
-    limits_deg: Vector2 | None = Field(None, description="minimum and maximum reading of a revolute joint")
-    limits_rad: Vector2 | None = Field(None, description="minimum and maximum reading of a revolute joint")
-    limits_m: Vector2 | None = Field(None, description="minimum and maximum reading of a prismatic joint")
+    limits_deg: Limits | None = Field(None, description="minimum and maximum reading of a revolute joint")
+    limits_rad: Limits | None = Field(None, description="minimum and maximum reading of a revolute joint")
+    limits_m: Limits | None = Field(None, description="minimum and maximum reading of a prismatic joint")
 
     @property
     def limits(self) -> tuple[float, float]:
@@ -65,7 +60,7 @@ class _Joint(Section):
         return self.limits_rad or self.limits_m or (-math.inf, math.inf)
 
     def contradictions(self) -> Iterator[Note]:
-        """Limits in two units, of the other type of joint, or upside down."""
+        """Limits in two units, or of the other type of joint."""
         given = self.given("limits_deg", "limits_rad", "limits_m")
         if len(given) > 1:
             yield (given[1],), f"{given[0]} is set as well; keep one"
@@ -73,11 +68,8 @@ class _Joint(Section):
             if (name == "limits_m") != (self.type == "P"):
                 units = "limits_m" if self.type == "P" else "limits_deg or limits_rad"
                 yield (name,), f"a joint of type {self.type} takes {units}"
-            low, high = getattr(self, name)
-            if what := _upside_down(low, high):
-                yield (name,), what
-            elif name == "limits_rad" and (what := like_degrees(low, high)):
-                yield (name,), f"{what} set limits_deg"
+        if self.limits_rad is not None and (what := like_degrees(*self.limits_rad)):
+            yield ("limits_rad",), f"{what} set limits_deg"
 
 
 class _DHJoint(_Joint):
@@ -110,35 +102,28 @@ class _DH(Section):
     joints: tuple[_DHJoint, ...] = Field(
         min_length=1, max_length=64, description="rows of the table, base to tool"
     )
-    tool: Matrix44 = Field(_IDENTITY, description="pose of the tool in the frame of the last joint, m")
-
-    def contradictions(self) -> Iterator[Note]:
-        """A tool that is nowhere."""
-        if what := not_rigid(self.tool):
-            yield ("tool",), what
+    tool: Pose = Field(_IDENTITY, description="pose of the tool in the frame of the last joint, m")
 
 
 class _Screws(Section):
     """Joint screws at a reference: T(q) = Π exp(screw_i (q_i − reference_i)) · base_tool."""
 
     reference: JointVector = Field(description="joint readings of the pose in which the screws are given")
-    base_tool: Matrix44 = Field(description="pose of the tool in the base frame at the reference, m")
+    base_tool: Pose = Field(description="pose of the tool in the base frame at the reference, m")
     joints: tuple[_ScrewJoint, ...] = Field(
         min_length=1, max_length=64, description="joint screws, base to tool"
     )
 
     def contradictions(self) -> Iterator[Note]:
-        """A reading too many or too few, or a tool that is nowhere."""
+        """A reading too many or too few."""
         yield from self.reference.miscounted("".join(joint.type for joint in self.joints), "reference")
-        if what := not_rigid(self.base_tool):
-            yield ("base_tool",), what
 
 
 class LimitSettings(OneOf):
     """Joint limits of a robot without kinematics in the configuration."""
 
     one_of = ("joints", "from_data")
-    joints: Annotated[tuple[Vector2, ...], Field(min_length=1, max_length=64)] | None = Field(
+    joints: Annotated[tuple[Limits, ...], Field(min_length=1, max_length=64)] | None = Field(
         None, description="minimum and maximum reading of each joint, base to tool"
     )
     unit: Literal["deg", "rad"] | None = Field(None, description="unit of the revolute joints")
@@ -149,13 +134,10 @@ class LimitSettings(OneOf):
     )
 
     def contradictions(self) -> Iterator[Note]:
-        """Two ways to say them or none, a unit too many or too few, or limits upside down."""
+        """Two ways to say them or none, or a unit too many or too few."""
         yield from super().contradictions()
         if (self.joints is None) != (self.unit is None):
             yield ("unit",), "is that of joints: give both or neither"
-        for i, (low, high) in enumerate(self.joints or ()):
-            if what := _upside_down(low, high):
-                yield ("joints", i), what
 
     def values(self, joint_types: str) -> tuple[tuple[float, float], ...]:
         """Those that are given, in rad (R) and m (P), one for each letter of ``joint_types``.

@@ -7,6 +7,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar, cast
 
 import numpy as np
 from pydantic import (
+    AfterValidator,
     BaseModel,
     ConfigDict,
     Field,
@@ -32,6 +33,38 @@ Positive = Annotated[float, Strict(), Field(gt=0)]
 NotNegative = Annotated[float, Strict(), Field(ge=0)]
 Whole = Annotated[int, Strict(), Field(ge=0, le=2**63 - 1)]
 Count = Annotated[int, Strict(), Field(ge=1, le=1_000_000)]
+
+
+def _limits(limits: Vector2) -> Vector2:
+    """Two limits, the lower first; else ValueError."""
+    low, high = limits
+    if low >= high:
+        raise ValueError(f"the lower limit {low:g} must be below the upper limit {high:g}")
+    return limits
+
+
+_TOLERANCE = 1e-6  # of rotations and unit axes written with seven digits or more
+
+
+def not_rigid(T: Matrix44) -> str:
+    """Return the reason why a matrix is no pose; empty if it is one."""
+    R = np.array(T)[:3, :3]
+    if T[3] != (0, 0, 0, 1):
+        return "the last row must be [0, 0, 0, 1]"
+    if abs(R).max() > 2 or abs(R @ R.T - np.eye(3)).max() > _TOLERANCE or np.linalg.det(R) < 0:
+        return "the upper left 3×3 block must be a rotation, written with seven digits or more"
+    return ""
+
+
+def _pose(T: Matrix44) -> Matrix44:
+    """A matrix that is a pose; else ValueError."""
+    if what := not_rigid(T):
+        raise ValueError(what)
+    return T
+
+
+Limits = Annotated[Vector2, AfterValidator(_limits)]
+Pose = Annotated[Matrix44, AfterValidator(_pose)]
 
 
 def _one_or_each(value: Any, of_one: Callable[[Any], tuple[int, int]]) -> Any:
@@ -69,7 +102,6 @@ SizesByName = Annotated[
 ]
 # The path from a section to a value in it, and the error of that value.
 Note = tuple[tuple[str | int, ...], str]
-_TOLERANCE = 1e-6  # of rotations and unit axes written with seven digits or more
 CONTRADICTIONS = "contradictions"  # type of the error that holds them
 
 _Part = TypeVar("_Part", bound="Section")
@@ -209,16 +241,6 @@ class JointVector(Section):
         if len(self.joints) != len(joint_types):
             what = f"{len(self.joints)} values for {len(joint_types)} joints ({joint_types})"
             yield (*path, "joints"), what
-
-
-def not_rigid(T: Matrix44) -> str:
-    """Return the reason why a matrix is no pose; empty if it is one."""
-    R = np.array(T)[:3, :3]
-    if T[3] != (0, 0, 0, 1):
-        return "the last row must be [0, 0, 0, 1]"
-    if abs(R).max() > 2 or abs(R @ R.T - np.eye(3)).max() > _TOLERANCE or np.linalg.det(R) < 0:
-        return "the upper left 3×3 block must be a rotation, written with seven digits or more"
-    return ""
 
 
 def not_a_screw(kind: str, w: Vector3, v: Vector3) -> Iterator[tuple[str, str]]:

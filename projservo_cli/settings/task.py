@@ -103,6 +103,8 @@ class GoalImages(ByView):
         yield from super().contradictions()
         if not self.view:
             yield (), "give left, right or other cameras by their names: the pixels of the markers there"
+        if self.markers is not None and len({*self.markers}) < len(self.markers):
+            yield ("markers",), "a number stands here twice"
         for key, value in (self.model_extra or {}).items():
             named, numbers = _OF_SIGMA.fullmatch(key), any(isinstance(entry, float) for entry in value)
             if named is None and numbers:
