@@ -133,9 +133,9 @@ class _Document:
         self.problems.append((path, what, place))
 
     @classmethod
-    def read(cls, path: pathlib.Path | str) -> "_Document":
+    def read(cls, path: pathlib.Path | str, expected: str = "a configuration (YAML)") -> "_Document":
         """The document in a file; an InputError where there is none."""
-        return cls(text_of(path, "a configuration (YAML)", _MAX_BYTES), str(path))
+        return cls(text_of(path, expected, _MAX_BYTES), str(path))
 
     @classmethod
     def of(cls, values: Any, name: str) -> "_Document":
@@ -680,9 +680,7 @@ def _taught(
             f"{where}: there is no {file.resolve()} yet: teach it first, before a recording: {command}"
         )
     try:
-        taught = _Document(
-            text_of(file.resolve(), "a file that projservo teach wrote", _MAX_BYTES), str(file.resolve())
-        )
+        taught = _Document.read(file.resolve(), "a file that projservo teach wrote")
     except InputError as error:
         raise InputError(f"{where}: {error}") from error
     images = taught.values.get("images") if isinstance(taught.values, dict) else None

@@ -38,6 +38,16 @@ def _folder_name(name: str) -> str:
 FolderName = Annotated[str, StringConstraints(max_length=100), AfterValidator(_folder_name)]
 
 
+_Rule = Callable[..., Iterator[Note]]
+_RULES: dict[_Rule, set[str]] = {}  # with the sections that each takes
+
+
+def _between(rule: _Rule) -> _Rule:
+    """Mark a rule between sections: those that its arguments name, asked where all of them are sound."""
+    _RULES[rule] = {*inspect.signature(rule).parameters}
+    return rule
+
+
 def _joint_types(robot: RobotSettings | None, data: Data | None) -> str:
     """One letter a joint, R or P; empty if only the table has their number."""
     if data is not None and data.joints is not None:
@@ -45,6 +55,7 @@ def _joint_types(robot: RobotSettings | None, data: Data | None) -> str:
     return robot.joint_types if robot is not None else ""
 
 
+@_between
 def _limits_in_joint_space(
     plant: PlantSettings, trajectory: Trajectory, robot: RobotSettings | None
 ) -> Iterator[Note]:
@@ -53,12 +64,14 @@ def _limits_in_joint_space(
         yield ("robot",), f"the profile joint_space needs the limits of all joints: {LIMITS_MISSING}"
 
 
+@_between
 def _same_joints(robot: RobotSettings | None, data: Data | None) -> Iterator[Note]:
     given = _joint_types(robot, data)
     if robot is not None and robot.joints and given != robot.joint_types:
         yield ("data", "joints"), f"{given} are not the joints of the robot, {robot.joint_types}"
 
 
+@_between
 def _joint_vectors(
     robot: RobotSettings | None,
     data: Data | None,
@@ -99,6 +112,7 @@ def _beyond_limits(robot: RobotSettings, vector: JointVector, *path: str) -> Ite
             yield (*path, "joints", i), f"{at} is outside the limits of joint {i + 1}, {least} to {most}"
 
 
+@_between
 def _goal_images(
     task: TaskSettings | None, markers: Markers | None, trajectory: Trajectory
 ) -> Iterator[Note]:
@@ -130,6 +144,7 @@ def _images_of(
             yield (*path, key), f"marker {number} of the face is not seen; show the whole face"
 
 
+@_between
 def _incidences(
     features: Mapping[str, Feature], task: TaskSettings | None, markers: Markers | None, control: Control
 ) -> Iterator[Note]:
@@ -158,6 +173,7 @@ def _incidences(
         yield ("control", "features"), "incidences are measured with the body: leave points out"
 
 
+@_between
 def _objects(
     objects: Objects, markers: Markers | None, rig: Rig | None, data: Data | None, plant: PlantSettings
 ) -> Iterator[Note]:
@@ -184,6 +200,7 @@ def carriers_of(goal: Goal, features: Mapping[str, Feature]) -> tuple[str, ...]:
     return tuple(name for name in dict.fromkeys(on) if name not in WORLD_AND_TOOL)
 
 
+@_between
 def _carried(
     objects: Objects, features: Mapping[str, Feature], task: TaskSettings | None, plant: PlantSettings
 ) -> Iterator[Note]:
@@ -233,11 +250,13 @@ def _carried_by(
         yield (*path, "objects", carrier), f"has markers that are not of {carrier}: teach it again"
 
 
+@_between
 def _simulated_alone(disturbance: Disturbance, plant: PlantSettings) -> Iterator[Note]:
     if not plant.simulated and disturbance != Disturbance():
         yield ("disturbance",), "disturbs the simulated robot; leave it out where plant.use names another"
 
 
+@_between
 def _force(plant: PlantSettings, stop: Stop) -> Iterator[Note]:
     if plant.use is None and stop.max_force_n is not None:
         yield (
@@ -246,6 +265,7 @@ def _force(plant: PlantSettings, stop: Stop) -> Iterator[Note]:
         )
 
 
+@_between
 def _rendered(plant: PlantSettings, noise: Noise, markers: Markers | None, rig: Rig | None) -> Iterator[Note]:
     """Yield keys without effect for rendered images."""
     if plant.use != RENDERED:
@@ -262,12 +282,14 @@ def _rendered(plant: PlantSettings, noise: Noise, markers: Markers | None, rig: 
         yield ("markers",), "plant mujoco shows tags: set markers.tags, such as roof"
 
 
+@_between
 def _dictionary(plant: PlantSettings, markers: Markers | None) -> Iterator[Note]:
     """Yield a dictionary of tags that is given twice."""
     if markers is not None and markers.dictionary is not None and "dictionary" in plant.options:
         yield ("markers", "dictionary"), "plant.options gives the class its dictionary as well; keep one"
 
 
+@_between
 def _cameras(plant: PlantSettings, markers: Markers | None, cameras: Cameras | None) -> Iterator[Note]:
     """Cameras of nobody, or with nothing to find."""
     if cameras is None:
@@ -277,25 +299,28 @@ def _cameras(plant: PlantSettings, markers: Markers | None, cameras: Cameras | N
             ("cameras",),
             "are those of a robot that is not simulated: set plant.use to its class, or leave them out",
         )
-    if markers is None or (markers.tags, markers.numbers, markers.board) == (None, None, None):
+    if markers is None or not markers.given("tags", "numbers", "board"):
         yield (
             ("cameras",),
             "find tags: set markers.tags, markers.numbers of their corners (4 t + k), or markers.board",
         )
 
 
+@_between
 def _same_mount(rig: Rig | None, data: Data | None) -> Iterator[Note]:
     """Yield a mount that rig and table state otherwise."""
     if rig is not None and data is not None and data.mount not in (None, rig.mount):
         yield ("data", "mount"), f"is {data.mount} where rig.mount is {rig.mount}: keep one"
 
 
+@_between
 def _moving_images(rig: Rig | None, trajectory: Trajectory) -> Iterator[Note]:
     """Yield regions of images that move with the tool."""
     if rig is not None and rig.mount == TOOL and trajectory.keep_out:
         yield ("trajectory", "keep_out"), "are regions of images that stand still; cameras on the tool move"
 
 
+@_between
 def _disturbed_joints(disturbance: Disturbance, robot: RobotSettings | None) -> Iterator[Note]:
     if robot is None or not robot.joints:
         return
@@ -310,6 +335,7 @@ def _disturbed_joints(disturbance: Disturbance, robot: RobotSettings | None) -> 
             yield ("disturbance", "joint_moved"), f"joint {moved.joint} is of type {letter}: give {fitting}"
 
 
+@_between
 def _disturbed_markers(disturbance: Disturbance, markers: Markers | None) -> Iterator[Note]:
     lost, moved = disturbance.lost_markers, disturbance.marker_moved
     if lost is not None and lost.markers is not None and markers is not None:
@@ -319,6 +345,7 @@ def _disturbed_markers(disturbance: Disturbance, markers: Markers | None) -> Ite
             yield ("disturbance", "marker_moved", "marker"), what
 
 
+@_between
 def _disturbed_objects(disturbance: Disturbance, objects: Objects, plant: PlantSettings) -> Iterator[Note]:
     moved = disturbance.object_moved
     if moved is None:
@@ -328,11 +355,13 @@ def _disturbed_objects(disturbance: Disturbance, objects: Objects, plant: PlantS
         known = ", ".join(placed) or "none"
         what = f"there is no object {moved.name} with places under objects; objects: {known}"
         yield ("disturbance", "object_moved", "name"), what
-    elif plant.rendered is not None:
+    elif plant.use == RENDERED:
         yield ("disturbance", "object_moved"), "moves no object before rendered cameras; leave plant.use out"
 
 
-def _plan_to_follow(control: Control, trajectory: Trajectory) -> Iterator[Note]:
+@_between
+def _followed_plan(control: Control, trajectory: Trajectory) -> Iterator[Note]:
+    """Yield modes that follow a plan without a time, or no plan where one has to keep out of regions."""
     limits = (control.joint_speed_limit_deg_s, control.prismatic_speed_limit_m_s)
     if any(mode != REGULATE for mode in control.mode) and {*limits, trajectory.duration_s} == {None}:
         yield (
@@ -340,9 +369,6 @@ def _plan_to_follow(control: Control, trajectory: Trajectory) -> Iterator[Note]:
             "follows the plan in time, and nothing gives it one: set trajectory.duration_s, or a limit with "
             "control.joint_speed_limit_deg_s",
         )
-
-
-def _keeping_out(control: Control, trajectory: Trajectory) -> Iterator[Note]:
     if trajectory.keep_out and REGULATE in control.mode:
         yield (
             ("control", "mode"),
@@ -351,6 +377,7 @@ def _keeping_out(control: Control, trajectory: Trajectory) -> Iterator[Note]:
         )
 
 
+@_between
 def _speed_in_joint_space(
     control: Control, trajectory: Trajectory, robot: RobotSettings | None, data: Data | None
 ) -> Iterator[Note]:
@@ -358,36 +385,6 @@ def _speed_in_joint_space(
     for letter, key in (("R", "joint_speed_limit_deg_s"), ("P", "prismatic_speed_limit_m_s")):
         if trajectory.profile == "joint_space" and letter in types and getattr(control, key) is None:
             yield ("control", key), "the profile joint_space goes as fast as joints can: give their limit"
-
-
-_RULES: dict[Callable[..., Iterator[Note]], set[str]] = {  # with the sections that each takes
-    rule: {*inspect.signature(rule).parameters}
-    for rule in (
-        *(
-            _same_joints,
-            _joint_vectors,
-            _goal_images,
-            _incidences,
-            _objects,
-            _carried,
-            _simulated_alone,
-            _force,
-            _rendered,
-        ),
-        *(
-            _dictionary,
-            _cameras,
-            _same_mount,
-            _moving_images,
-            _disturbed_joints,
-            _disturbed_markers,
-            _disturbed_objects,
-            _plan_to_follow,
-            _keeping_out,
-        ),
-        *(_speed_in_joint_space, _limits_in_joint_space),
-    )
-}
 
 
 def _missing(sections: Mapping[str, Any]) -> Iterator[Note]:
