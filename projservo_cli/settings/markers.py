@@ -5,12 +5,12 @@ from collections.abc import Iterator, Sequence
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, PlainValidator, Strict, StringConstraints, WithJsonSchema
+from pydantic import Field, PlainValidator, Strict, WithJsonSchema
 from scipy.spatial.transform import Rotation
 
 from projservo_cli.detection import LEAST_ROWS, Board
 from projservo_cli.records import CORNERS, FloatArray
-from projservo_cli.settings.sections import Note, Pose, Positive, Section, Vector3, Whole
+from projservo_cli.settings.sections import Note, Pose, Positive, Section, Text, Vector3, Whole
 
 GROUND = 4.0 / 3.0
 """Width of a tag of six cells with a bright margin of one cell, over that without."""
@@ -50,7 +50,6 @@ class Tag(Section):
 
 
 _Side = Annotated[int, Strict(), Field(ge=LEAST_ROWS, le=1000)]
-_Dictionary = Annotated[str, StringConstraints(min_length=1)]
 
 
 class BoardSettings(Section):
@@ -60,7 +59,7 @@ class BoardSettings(Section):
     rows: _Side = Field(description="rows of inner corners of a chessboard, of squares of a ChArUco board")
     columns: _Side = Field(description="columns, counted likewise")
     size_m: Positive | None = Field(None, description="side of a square; null if unknown")
-    dictionary: _Dictionary | None = Field(
+    dictionary: Text | None = Field(
         None, description="of the tags on a ChArUco board by its OpenCV name; null: 4X4_50"
     )
     first: Whole | None = Field(None, description="number of the first tag on a ChArUco board; null: 0")
@@ -139,7 +138,7 @@ class Markers(Section):
     board: BoardSettings | None = Field(
         None, description="board whose inner corners are the markers, numbered row by row as OpenCV does"
     )
-    dictionary: _Dictionary | None = Field(
+    dictionary: Text | None = Field(
         None,
         description="tag dictionary by its OpenCV name; null: 4X4_50; passed to a robot class that "
         "accepts it",

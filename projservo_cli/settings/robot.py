@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field, StringConstraints
+from pydantic import Field
 
 from projservo_cli.records import TWO_TURNS, VIEWS
 from projservo_cli.settings.sections import (
@@ -21,12 +21,12 @@ from projservo_cli.settings.sections import (
     Positive,
     Section,
     Sizes,
+    Text,
     Vector2,
     Vector3,
     not_a_screw,
 )
 
-_File = Annotated[str, StringConstraints(min_length=1)]
 _IDENTITY: Pose = (
     (1.0, 0.0, 0.0, 0.0),
     (0.0, 1.0, 0.0, 0.0),
@@ -158,10 +158,10 @@ class RobotSettings(Section):
     name: str = Field("", description="name in figures and reports")
     dh: _DH | None = Field(None, description="Denavit-Hartenberg table")
     screws: _Screws | None = Field(None, description="joint screws at a reference")
-    mjcf: _File | None = Field(
+    mjcf: Text | None = Field(
         None, description="path of a MuJoCo model, which the plant mujoco simulates and renders"
     )
-    urdf: _File | None = Field(None, description="path of a URDF, of which only the screws are read")
+    urdf: Text | None = Field(None, description="path of a URDF, of which only the screws are read")
     tip: str | None = Field(None, description="body or site of mjcf, or link of urdf, that carries the tool")
     limits: LimitSettings | None = Field(None, description="joint limits of a robot without dh and screws")
 

@@ -13,6 +13,7 @@ from pydantic import (
     Field,
     PlainSerializer,
     Strict,
+    StringConstraints,
     ValidationInfo,
     WithJsonSchema,
     WrapValidator,
@@ -33,6 +34,8 @@ Positive = Annotated[float, Strict(), Field(gt=0)]
 NotNegative = Annotated[float, Strict(), Field(ge=0)]
 Whole = Annotated[int, Strict(), Field(ge=0, le=2**63 - 1)]
 Count = Annotated[int, Strict(), Field(ge=1, le=1_000_000)]
+Text = Annotated[str, StringConstraints(min_length=1)]
+"""Text that is not empty, such as the path of a file."""
 
 
 def _limits(limits: Vector2) -> Vector2:

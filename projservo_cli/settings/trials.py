@@ -14,6 +14,7 @@ from projservo_cli.settings.sections import (
     Positive,
     Section,
     SizesByName,
+    Text,
     Whole,
 )
 
@@ -53,12 +54,8 @@ class Refit(Section):
     """A camera of a calibration that moved, and a table of images by which it is fitted again."""
 
     view: str = Field(description="name of the camera")
-    table: Annotated[str, StringConstraints(min_length=1)] = Field(
-        description="path of the observation table, relative to the configuration"
-    )
-    readings: Annotated[str, StringConstraints(min_length=1)] | None = Field(
-        None, description="path of a table of joints, where table lists detections"
-    )
+    table: Text = Field(description="path of the observation table, relative to the configuration")
+    readings: Text | None = Field(None, description="path of a table of joints, where table lists detections")
     joint_unit: Literal["deg", "rad"] | None = Field(
         None, description="unit of revolute joints; null: that of data"
     )
@@ -91,7 +88,7 @@ class CalibrationSettings(Section):
         description="error of predictions by deviations of arm and rig from the model above which the "
         "calibration is not usable, px; null: 1 % of the image size",
     )
-    init: Annotated[str, StringConstraints(min_length=1)] | None = Field(
+    init: Text | None = Field(
         None, description="JSON file of a known robot and rig, the first initial guess of the fit"
     )
     random_poses: StrictInt | None = Field(
@@ -138,10 +135,8 @@ class CalibrationSettings(Section):
 class Data(Section):
     """A recorded run: the observation table that stands in for simulated trial motions."""
 
-    table: Annotated[str, StringConstraints(min_length=1)] = Field(
-        description="path of the table, relative to the configuration"
-    )
-    readings: Annotated[str, StringConstraints(min_length=1)] | None = Field(
+    table: Text = Field(description="path of the table, relative to the configuration")
+    readings: Text | None = Field(
         None,
         description="path of a table of joints, pose and q1 ... qN, where table lists the detections of any "
         "cameras: pose, camera, marker, u, v",
