@@ -1,19 +1,30 @@
-"""Generated regions of the pages: references that the code writes about itself.
+"""What the code writes about itself: JSON Schemas, and generated regions of the pages.
 
 A region stands between ``<!-- generated: NAME -->`` and ``<!-- end of NAME -->``; ``python -m docs.generate``
 writes all of them anew.
 """
 
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 from docs.generate.regions import WRITERS
+from projservo_cli.config.schema import as_text, json_schema, sweep_schema
 
 DOCS = Path(__file__).parents[1]
+CONFIGS = DOCS.parent / "configs"
 REGION = re.compile(
     r"(?P<begin>^<!-- generated: (?P<name>[\w-]+) -->\n).*?(?P<end>^<!-- end of (?P=name) -->$)",
     flags=re.MULTILINE | re.DOTALL,
 )
+
+
+def files() -> Iterator[tuple[Path, str]]:
+    """Yield schemas and pages, each with the text that it is to have."""
+    yield CONFIGS / "schema.json", as_text(json_schema())
+    yield CONFIGS / "sweep.schema.json", as_text(sweep_schema())
+    for page in sorted(DOCS.rglob("*.md")):
+        yield page, generated(page.read_text(encoding="utf-8"))
 
 
 def generated(text: str) -> str:

@@ -1,10 +1,18 @@
-"""Write the generated regions of all pages: ``python -m docs.generate``."""
+"""Write all that is generated, pages, schemas and the names of pages: ``python -m docs.generate``."""
 
-from docs.generate import DOCS, generated
+from pathlib import Path
 
-for page in sorted(DOCS.rglob("*.md")):
-    old = page.read_text(encoding="utf-8")
-    new = generated(old)
-    if new != old:
-        page.write_text(new, encoding="utf-8")
-        print(f"written: {page.relative_to(DOCS.parent)}")
+from docs.generate import DOCS, files
+from tests.documentation import test_documented_names as names
+
+
+def write(path: Path, text: str) -> None:
+    """Write a file whose text is another one, and say so."""
+    if path.read_text(encoding="utf-8") != text:
+        path.write_text(text, encoding="utf-8")
+        print(f"written: {path.relative_to(DOCS.parent)}")
+
+
+for path, text in files():
+    write(path, text)
+write(names.STORED, names.to_store())

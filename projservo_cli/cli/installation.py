@@ -1,6 +1,5 @@
 """The installation and how to begin with it: ``init``, ``schema``, ``doctor`` and ``bench``."""
 
-import json
 import os
 import sys
 from collections.abc import Iterator
@@ -34,7 +33,7 @@ def _init(console: Console, *, file: Path, arm: str | None, force: bool) -> None
     Writes a configuration that runs as it is, with a comment on every key, and next to it the schema by which
     editors complete and check it.
     """
-    from projservo_cli.config.schema import json_schema, starter
+    from projservo_cli.config.schema import as_text, json_schema, starter
     from projservo_cli.files import write_whole
 
     path = file / _STARTER if file.is_dir() else file
@@ -43,7 +42,7 @@ def _init(console: Console, *, file: Path, arm: str | None, force: bool) -> None
     option.require_new(path, force=force)
     described = path.with_name(_SCHEMA)
     write_whole(path, starter(arm))
-    write_whole(described, _as_text(json_schema()))
+    write_whole(described, as_text(json_schema()))
     words = [f"init: {path}, with {described} for editors"]
     if arm is None:
         words.append(f"next: projservo calibrate plan servo report -c {path}")
@@ -63,7 +62,7 @@ def _schema(console: Console, *, what: str | None, output: Path | None) -> None:
     Editors that speak YAML complete and check a configuration whose first line names the schema: #
     yaml-language-server: $schema=FILE. That of sweeps is projservo schema sweep.
     """
-    from projservo_cli.config.schema import json_schema, sweep_schema
+    from projservo_cli.config.schema import as_text, json_schema, sweep_schema
     from projservo_cli.files import write_whole
 
     schema = sweep_schema() if what else json_schema()
@@ -71,11 +70,7 @@ def _schema(console: Console, *, what: str | None, output: Path | None) -> None:
         console.as_json = True
         console.report(schema, ())
     else:
-        write_whole(output, _as_text(schema))
-
-
-def _as_text(schema: dict[str, Any]) -> str:
-    return json.dumps(schema, ensure_ascii=False, indent=2) + "\n"
+        write_whole(output, as_text(schema))
 
 
 @main.command("doctor", epilog="Example: projservo doctor -c arm.yaml --move")

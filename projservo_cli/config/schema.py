@@ -1,5 +1,6 @@
 """Aids to writing a configuration: a commented one to start from, and JSON Schemas for editors."""
 
+import json
 import re
 import textwrap
 from collections.abc import Iterator
@@ -46,6 +47,11 @@ def json_schema() -> dict[str, Any]:
 def sweep_schema() -> dict[str, Any]:
     """The schema of the configuration of a sweep."""
     return {**_schema(SweepConfig), "title": "Sweep of projservo"}
+
+
+def as_text(schema: dict[str, Any]) -> str:
+    """A schema as the text of a file."""
+    return json.dumps(schema, ensure_ascii=False, indent=2) + "\n"
 
 
 def _schema(model: type[BaseModel]) -> dict[str, Any]:

@@ -1,6 +1,5 @@
 """The JSON Schemas and the starter: both say what the models say, and accept what loads."""
 
-import json
 import re
 
 import pytest
@@ -9,9 +8,8 @@ import yaml
 from projservo_cli.config import load_config, load_sweep
 from projservo_cli.config.schema import json_schema, starter, sweep_schema
 from projservo_cli.records import InputError
-from tests.conftest import ROOT, SHIPPED, SWEEPS
+from tests.conftest import SHIPPED, SWEEPS
 
-CONFIGS = ROOT / "configs"
 LINE = re.compile(r"# yaml-language-server: \$schema=(\S+)\n")
 
 
@@ -29,13 +27,8 @@ def refused():
     return errors
 
 
-@pytest.mark.parametrize(
-    ("name", "schema"), [("schema.json", json_schema), ("sweep.schema.json", sweep_schema)]
-)
-def test_the_shipped_schema_is_the_one_of_the_models(name, schema):
-    text = json.dumps(schema(), ensure_ascii=False, indent=2) + "\n"
-    assert (CONFIGS / name).read_text(encoding="utf-8") == text, f"projservo schema -o configs/{name}"
-    assert "name" not in schema().get("required", [])
+def test_schemas_are_in_the_form_of_every_draft_and_ask_for_no_name():
+    assert not [schema for schema in (json_schema(), sweep_schema()) if "name" in schema.get("required", [])]
     rig = json_schema()["$defs"]["Rig"]["properties"]
     size, _ = rig["image_size_px"]["anyOf"]  # in the form of every draft
     assert (size["minItems"], size["maxItems"], size["items"]["type"]) == (2, 2, "integer")

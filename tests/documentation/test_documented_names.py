@@ -2,8 +2,8 @@
 
 Names stand in code and inline code, in references, and in tables of fields and columns. Each is stored beside
 this file as an expression: ``calibration.predict(return_std=...)``, ``study.table['steps']``. The command
-``python -m tests.documentation.test_documented_names`` adds those of new text. Only by hand is a name taken
-away, with a line in CHANGELOG.md that says so.
+``python -m docs.generate`` adds those of new text. Only by hand is a name taken away, with a line in
+CHANGELOG.md that says so.
 """
 
 import ast
@@ -361,7 +361,7 @@ def stored_names():
 def test_names_of_the_pages_work_and_are_stored():
     found, broken = read_pages()
     assert broken == set()
-    assert found - {*stored_names()} == set(), "python -m tests.documentation.test_documented_names"
+    assert found - {*stored_names()} == set(), "python -m docs.generate"
 
 
 def test_names_that_pages_ever_gave_still_work():
@@ -371,11 +371,6 @@ def test_names_that_pages_ever_gave_still_work():
     assert {*stored_names()} - (reader.found - reader.broken) == set()
 
 
-def main():
-    """Add the names of the pages to those that are stored."""
-    stored = {*stored_names()} if STORED.exists() else set()
-    STORED.write_text("\n".join(sorted(stored | read_pages()[0])) + "\n", encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()
+def to_store():
+    """The names that are stored and those of the pages, a line each."""
+    return "\n".join(sorted({*stored_names()} | read_pages()[0])) + "\n"
