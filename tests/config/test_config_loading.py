@@ -270,6 +270,14 @@ def test_objects_before_cameras_on_the_tool_are_refused_in_one_line(good):
     assert "objects: cameras on the tool see the scene that the goal is on: its images carry" in found
 
 
+def test_wrong_options_of_a_plant_hide_nothing_else():
+    pushed = "disturbance.object_moved={at_step: 3, name: part}"
+    found = errors(shipped("object"), "plant={use: mujoco, options: {blurr_px: 1}}", pushed)
+    assert len(found) == 4  # two of markers and noise
+    assert any("plant.options.blurr_px: unknown key; did you mean blur_px?" in line for line in found)
+    assert any("disturbance.object_moved: moves no object before rendered" in line for line in found)
+
+
 @pytest.mark.parametrize(
     ("override", "says"),
     [
