@@ -1,9 +1,11 @@
-"""Control laws of the package, one line each in one table, and the names of their runs.
+"""Control laws of the package, one row each in one table, and the names of their runs.
 
-A law is added by its kernel in a file of ``control``, a line here and its function in ``control``.
+A law is added by its kernel in a file of ``control`` and a row here; one that is of none of the families
+has its function in ``control`` too.
 """
 
 from collections.abc import Iterable, Sequence
+from enum import Enum
 from typing import NamedTuple
 
 from projservo_cli.records import InputError
@@ -12,33 +14,95 @@ REGULATE = "regulate"
 TRACK = "track"
 IMAGE_TRACK = "image_track"
 INCIDENCES = "incidences"
-_POINTS = "points"
-_BODY = "body"
+# What a law does in each of its modes.
+MODES = {
+    REGULATE: "regulates to the goal in each step",
+    TRACK: "follows the joints of the plan, and corrects them by images",
+    IMAGE_TRACK: "follows the planned image paths",
+}
+
+
+class Family(Enum):
+    """Laws that share one function in ``control``."""
+
+    DIRECT = "direct"
+    CLASSICAL = "classical"  # needs the points of the face themselves; the others can measure with the body
+    EXACT = "exact"
+    INCIDENCES = "incidences"
 
 
 class _LawSpec(NamedTuple):
-    """Specification of one law for driving, storing and drawing."""
+    """Specification of one law for driving, storing, drawing and the reference."""
 
     title: str  # as figures write it
+    family: Family
     modes: tuple[str, ...]  # it follows a plan in all but ``REGULATE``
-    features: str  # needs the ``_POINTS`` of the face themselves, or can measure with the ``_BODY``
+    velocity: str  # that it asks of the joints, in Markdown
+    source: str  # in Markdown
     metric: bool = False  # is given the metric model
     paper: bool = True  # is one of [RH00]
 
 
 LAW_SPECS = {
-    "direct_three": _LawSpec("directTHREE", (REGULATE, TRACK), _BODY),
-    "direct_two": _LawSpec("directTWO", (REGULATE, TRACK), _BODY),
-    "stacked": _LawSpec("stacked Jacobians", (REGULATE, IMAGE_TRACK), _POINTS),
-    "blockwise": _LawSpec("block-wise", (REGULATE,), _POINTS),
-    "euclidean_points": _LawSpec("Euclidean points", (REGULATE,), _POINTS, metric=True),
-    "exact": _LawSpec("exact", (REGULATE, TRACK), _BODY, paper=False),
-    INCIDENCES: _LawSpec("incidences", (REGULATE,), _BODY, paper=False),
+    "direct_three": _LawSpec(
+        "directTHREE",
+        Family.DIRECT,
+        (REGULATE, TRACK),
+        r"$\lambda_t\tau\hat q_t+\lambda_r\theta_r\hat q_r+\lambda_p\theta_p\hat q_p$",
+        "(20) as corrected",
+    ),
+    "direct_two": _LawSpec(
+        "directTWO",
+        Family.DIRECT,
+        (REGULATE, TRACK),
+        r"$\lambda_t\tau\hat q_t+\lambda_s\theta_s\hat q_s$",
+        "(23) as corrected",
+    ),
+    "stacked": _LawSpec(
+        "stacked Jacobians",
+        Family.CLASSICAL,
+        (REGULATE, IMAGE_TRACK),
+        r"$-\lambda J^+(s-s^*)$, both views stacked",
+        "[RH00] reference 8",
+    ),
+    "blockwise": _LawSpec(
+        "block-wise",
+        Family.CLASSICAL,
+        (REGULATE,),
+        r"$-\lambda(J_l^+e_l+J_r^+e_r)$, a pseudo-inverse a view",
+        "[RH00] reference 10",
+    ),
+    "euclidean_points": _LawSpec(
+        "Euclidean points",
+        Family.CLASSICAL,
+        (REGULATE,),
+        r"$-\lambda J^+(X-X^*)$ on triangulated metric points, given the metric model",
+        "[RH00] section 6",
+        metric=True,
+    ),
+    "exact": _LawSpec(
+        "exact",
+        Family.EXACT,
+        (REGULATE, TRACK),
+        "the joint step that displaces the face as (22) wants, solved on (6)",
+        "[the exact law](../explanation/mathematics.md#the-exact-law)",
+        paper=False,
+    ),
+    INCIDENCES: _LawSpec(
+        "incidences",
+        Family.INCIDENCES,
+        (REGULATE,),
+        r"$-\lambda J^+e+(I-J^+J)z$ on the [incidences of the goal](../how-to/align-and-insert.md), or on "
+        "the whole pose",
+        "[incidences](../explanation/mathematics.md#incidences)",
+        paper=False,
+    ),
 }
 LAWS = tuple(LAW_SPECS)
 CODES = {law: code for code, law in enumerate(LAWS)}  # codes of the laws in compiled code
-POINT_LAWS = tuple(law for law, spec in LAW_SPECS.items() if spec.features == _POINTS)
-BODY_LAWS = tuple(law for law, spec in LAW_SPECS.items() if spec.features == _BODY)
+PAPER_LAWS = tuple(law for law, spec in LAW_SPECS.items() if spec.paper)
+POINT_LAWS = tuple(law for law, spec in LAW_SPECS.items() if spec.family is Family.CLASSICAL)
+BODY_LAWS = tuple(law for law, spec in LAW_SPECS.items() if spec.family is not Family.CLASSICAL)
 _NAMES = {
     f"{law}_{mode}": (law, mode) for law, spec in LAW_SPECS.items() for mode in spec.modes if mode != REGULATE
 }

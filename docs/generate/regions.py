@@ -15,6 +15,7 @@ from projservo_cli import records
 from projservo_cli.cli import main
 from projservo_cli.cli.equations import REGISTER
 from projservo_cli.config.schema import json_schema, sweep_schema
+from projservo_cli.laws import INCIDENCES, LAW_SPECS, MODES, POINT_LAWS
 from projservo_cli.loop import verdicts as loop_verdicts
 from projservo_cli.sweeps.runs import BETWEEN, NUMBERED, measured_columns
 from projservo_cli.words import ROWS
@@ -124,6 +125,24 @@ def sweep_columns() -> Iterator[str]:
     yield "`self_occluded_steps_<view>`; random tasks show the face to `trajectory.visible_views` of them."
 
 
+def laws() -> Iterator[str]:
+    """The control laws with their formulas, what each measures, and its source."""
+    rows = []
+    for name, law in LAW_SPECS.items():
+        measures = "face" if name in POINT_LAWS else "body, always" if name == INCIDENCES else "body"
+        rows.append((f"`{name}`", law.family.value, law.velocity, measures, law.source))
+    yield from table(("law", "family", "joint velocity", "measures", "source"), rows)
+
+
+def modes() -> Iterator[str]:
+    """The modes of the laws, and which laws have each."""
+    rows = []
+    for mode, does in MODES.items():
+        able = [f"`{law}`" for law, spec in LAW_SPECS.items() if mode in spec.modes]
+        rows.append((f"`{mode}`", does, "all" if len(able) == len(LAW_SPECS) else ", ".join(able)))
+    yield from table(("mode (`control.mode`)", "action", "laws"), rows)
+
+
 def verdicts() -> Iterator[str]:
     """All verdicts of a run, and their order."""
     rows = []
@@ -159,6 +178,8 @@ WRITERS: dict[str, Callable[[], Iterator[str]]] = {
     "run-file-groups": run_file,
     "commands": commands,
     "equations": equations,
+    "laws": laws,
+    "modes": modes,
     "verdicts": verdicts,
     "findings": findings,
     "python-interface": python.python_interface,

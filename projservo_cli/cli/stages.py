@@ -266,7 +266,7 @@ def _servo(stages: Sequence[str], console: Console, **options: Any) -> int:
 
     Runs each law of control.laws (or of --law) to its verdict, and says why one did not converge. Calibrates
     and plans first where needed. Exit code 1 when a law of control.must_converge does not converge: by
-    default direct_three, direct_two, exact and plug-in laws.
+    default all but the classical ones.
 
     With --set plant=module:Class (or plant in the configuration) an external robot takes the place of the
     simulated one. It is driven to the start of the task and from there by each law, in every call, and

@@ -9,6 +9,7 @@ from projservo_cli.control.incidence_law import incidences
 from projservo_cli.control.law import LOST, OK, Gains, Law, State, example, limit_speed
 from projservo_cli.geometry.jit import ByAddress, internal, merged
 from projservo_cli.geometry.lens import distorts, undistort_into
+from projservo_cli.laws import LAW_SPECS, Family
 from projservo_cli.records import FloatArray, Model
 from projservo_cli.task.face import Task
 from projservo_cli.task.trajectory import Reference, following, near_joint_path, on_joint_path, reference_into
@@ -84,16 +85,15 @@ def _incidences_period(
     return _finished(task, gains, q, incidences(model, task, gains, straight, q, state), False, state)
 
 
-# Functions of the laws in the order of their codes. Each measures and commands once for all its codes.
-FUNCTIONS = (
-    _direct_period,
-    _direct_period,
-    _classical_period,
-    _classical_period,
-    _classical_period,
-    _exact_period,
-    _incidences_period,
-)
+# Functions of the families of laws. Each measures and commands once for all its codes.
+_PERIODS = {
+    Family.DIRECT: _direct_period,
+    Family.CLASSICAL: _classical_period,
+    Family.EXACT: _exact_period,
+    Family.INCIDENCES: _incidences_period,
+}
+# Functions of the laws in the order of their codes.
+FUNCTIONS = tuple(_PERIODS[spec.family] for spec in LAW_SPECS.values())
 
 
 @merged

@@ -9,7 +9,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, StrictInt, WithJson
 from pydantic_core import PydanticCustomError
 
 from projservo_cli import plugins
-from projservo_cli.laws import LAW_SPECS, LAWS, mode_in
+from projservo_cli.laws import BODY_LAWS, LAWS, PAPER_LAWS, mode_in
 from projservo_cli.settings.disturbance import Delays
 from projservo_cli.settings.sections import Count, Note, NotNegative, Number, Positive, Section, Whole
 
@@ -83,7 +83,7 @@ class LawChoice(Section):
     """Control laws to run, their modes, and those that must converge."""
 
     laws: tuple[_Law, ...] = Field(
-        tuple(law for law, spec in LAW_SPECS.items() if spec.paper),
+        PAPER_LAWS,
         min_length=1,
         description="control laws to run, each from the start; module:Class for a plug-in law",
     )
@@ -96,7 +96,7 @@ class LawChoice(Section):
     must_converge: tuple[_Law, ...] | None = Field(
         None,
         description="laws that fail the call (exit code 1) if they do not converge; null: "
-        "direct_three, direct_two, exact and plug-in laws",
+        f"{', '.join(BODY_LAWS)} and plug-in laws",
     )
 
 

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from projservo_cli.laws import PAPER_LAWS
 from projservo_cli.records import flat_fields
 from projservo_cli.store import run_file
 from tests.conftest import ROOT
@@ -46,7 +47,7 @@ def test_what_the_first_chain_prints_is_read_in_ten_seconds(first_chain):
     # The reason of a run that did not converge is one line, however long.
     short = [line for line in told.splitlines() if str(first_chain) not in line and " ended in " not in line]
     assert max(map(len, short)) <= 80
-    for law in ("direct_three", "direct_two", "stacked", "blockwise", "euclidean_points"):
+    for law in PAPER_LAWS:
         assert sum(line.split()[:1] == [law] for line in told.splitlines()) == 1
     assert f"page: {first_chain / 'report.html'}" in told
     assert " judged claims hold" in " ".join(told.split())

@@ -33,7 +33,7 @@ def hashes():
     noise = 0.5 * np.random.default_rng(7).standard_normal((11, 2, 4, 2))
     for types, laws in (("RRRRRR", LAWS), ("RRPRRR", ("direct_three", "stacked"))):
         for law in laws:
-            G = None if law == "euclidean_points" else frame(1)
+            G = None if LAW_SPECS[law].metric else frame(1)
             bounds = limits(speed=np.full(6, 0.8), max_steps=10)
             run = Run(scene(types=types), law, GAINS._replace(ratio_rp=2.0), bounds, noise, G)
             found[f"{law} {types}"] = hash_of(run)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from projservo_cli.control.law import ERRORS, OK
-from projservo_cli.laws import CODES
+from projservo_cli.laws import CODES, LAW_SPECS
 from projservo_cli.loop.python import BuiltInLaw, run_in_python
 from projservo_cli.loop.verdicts import VERDICT_NAMES
 from projservo_cli.simulation.analytic_plant import AnalyticPlant
@@ -40,7 +40,7 @@ def both(sc, law, bounds, noise, G=None, task=None, gains=GAINS):
 )
 def test_both_loops_are_equal_to_the_bit(law, types, rng):
     """With noise, a speed limit that is active, and a projective model for the laws that take one."""
-    G = None if law == "euclidean_points" else frame(2)
+    G = None if LAW_SPECS[law].metric else frame(2)
     noise = 0.3 * rng.normal(size=(41, 2, 4, 2))
     run = both(scene(types=types), law, limits(speed=np.full(6, 0.5), max_steps=40), noise, G)
     assert (run.full.factor < 1).any()

@@ -2,11 +2,10 @@
 
 import numpy as np
 
-from projservo_cli.laws import POINT_LAWS
+from projservo_cli.laws import PAPER_LAWS
 from projservo_cli.records import FloatArray, Trace
 from projservo_cli.report import panels, style
 from projservo_cli.report.report_data import (
-    DIRECT,
     Data,
     Driven,
     ReportData,
@@ -243,7 +242,7 @@ def _data_runs(report_data: Driven) -> Data:
 
 def _of_other_laws(report_data: Driven | ReportData) -> bool:
     """Whether runs are of laws that are not in the paper; those of a sequence have a figure of their own."""
-    others = {*moved(report_data)} - {*DIRECT, *POINT_LAWS}
+    others = {*moved(report_data)} - {*PAPER_LAWS}
     return bool(others) and not any("/" in name for name in others)
 
 

@@ -7,13 +7,15 @@ import textwrap
 import numpy as np
 
 from projservo_cli.geometry.kinematics import project
-from projservo_cli.laws import BODY_LAWS, POINT_LAWS, title_of
+from projservo_cli.laws import BODY_LAWS, PAPER_LAWS, POINT_LAWS, title_of
 from projservo_cli.loop.verdicts import plateau_stretches
 from projservo_cli.records import CORNERS, ByteArray, FloatArray, IncidenceHistory, IntArray, Trace
 from projservo_cli.report import panels, style
 from projservo_cli.report.report_data import DIRECT, Data, Driven, ReportData, percent, registered, title
 from projservo_cli.task.face import cyclic_order
 
+# Classical laws of the paper; those of others are among every run.
+_CLASSICAL = tuple(law for law in PAPER_LAWS if law in POINT_LAWS)
 _PANELS_WIDTH, _PANEL_WIDTH = 5.8, 3.6  # inches, of all panels side by side, and of one at most
 _PATH = style.line(style.BLACK, width=0.9, label="path of a marker")
 _PLATEAU = style.line(style.VERMILION, width=2.0, marker="s", label="plateau of the error")
@@ -24,7 +26,7 @@ def _data_classical(report_data: ReportData) -> Data:
     """Image paths of the classical laws that were run, with their hidden and standing stretches."""
     result: Data = {"image_size": report_data.plant.image_size}
     order = report_data.plant.order
-    for law in POINT_LAWS:
+    for law in _CLASSICAL:
         if law in report_data.traces:
             trace = report_data.traces[law]
             result |= {
@@ -47,7 +49,7 @@ def _panel_width(views: int) -> float:
     "Image trajectories of the classical laws",
     "Fig. 4, section 6",
     _data_classical,
-    laws=POINT_LAWS,
+    laws=_CLASSICAL,
     any_law=True,
     alt="A row for each classical law, a panel for each camera: the paths of the markers from start "
     "to goal, with the stretches in which the face is hidden and in which the image error "
@@ -55,7 +57,7 @@ def _panel_width(views: int) -> float:
 )
 def _draw_classical(data: Data, figure: "style.Figure") -> None:
     """One row a law, one column a camera."""
-    laws, size = [law for law in POINT_LAWS if f"s_{law}" in data], data["image_size"]
+    laws, size = [law for law in _CLASSICAL if f"s_{law}" in data], data["image_size"]
     names = data["view"]
     drawn = [np.concatenate([data[f"s_{law}"], data[f"s_star_{law}"][None]]) for law in laws]
     near = [[style.near_pixels(s[:, view], size[view]) for view in range(len(names))] for s in drawn]
