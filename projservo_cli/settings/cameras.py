@@ -75,5 +75,5 @@ class Cameras(ByView):
 
     @property
     def sources(self) -> dict[str, Source]:
-        """Return the cameras by name: left and right first, others in the order in which they are written."""
-        return {name: one for name, one in self if isinstance(one, Source)}
+        """Return the cameras by their names."""
+        return self.by_view

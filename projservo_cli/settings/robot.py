@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from projservo_cli.records import TWO_TURNS, VIEWS
+from projservo_cli.records import TWO_TURNS
 from projservo_cli.settings.sections import (
     ByView,
     JointVector,
@@ -243,9 +243,8 @@ class Rig(ByView):
 
     @property
     def cameras(self) -> dict[str, Camera]:
-        """The cameras by their names: left and right first, others in the order of the file."""
-        found = self.__pydantic_extra__ or {}
-        return {name: found[name] for name in (*filter(found.__contains__, VIEWS), *found)}
+        """The cameras by their names."""
+        return self.by_view
 
     def contradictions(self) -> Iterator[Note]:
         """No camera, a name that no column can have, or sizes of other numbers of images."""

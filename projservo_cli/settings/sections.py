@@ -22,7 +22,7 @@ from pydantic import (
 from pydantic_core import PydanticCustomError
 
 from projservo_cli.image_size import view_named
-from projservo_cli.records import FARTHEST_M, VIEW_NAME, FloatArray
+from projservo_cli.records import FARTHEST_M, VIEW_NAME, VIEWS, FloatArray
 
 Number = Annotated[float, Strict()]
 Vector2 = tuple[Number, Number]
@@ -161,6 +161,12 @@ class ByView(Section):
     """A section whose further keys are names of views like ``left`` and ``right``."""
 
     model_config = ConfigDict(extra="allow")
+
+    @property
+    def by_view(self) -> dict[str, Any]:
+        """What is given by names of views: left and right first, others in the order of the file."""
+        found = {name: getattr(self, name, None) for name in (*VIEWS, *(self.model_extra or {}))}
+        return {name: value for name, value in found.items() if value is not None}
 
     def contradictions(self) -> Iterator[Note]:
         """Yield names that no column of a table can have."""

@@ -17,7 +17,7 @@ from pydantic import (
     WrapValidator,
 )
 
-from projservo_cli.records import VIEWS, InputError
+from projservo_cli.records import InputError
 from projservo_cli.settings.features import Feature, Name, Pair
 from projservo_cli.settings.sections import (
     ByView,
@@ -116,9 +116,8 @@ class GoalImages(ByView):
 
     @property
     def view(self) -> tuple[str, ...]:
-        """Names of the cameras: left and right first, others in the order in which they are written."""
-        further = [key for key in self.model_extra or {} if not _OF_SIGMA.fullmatch(key)]
-        return (*self.given(*VIEWS), *further)
+        """Names of the cameras."""
+        return tuple(key for key in self.by_view if not _OF_SIGMA.fullmatch(key))
 
     def side(self, key: str) -> tuple[Any, ...] | None:
         """Return the entries under the name of a camera, or under the key of its deviations; None without."""
@@ -383,23 +382,17 @@ class KeptOut(ByView):
     def contradictions(self) -> Iterator[Note]:
         """No polygon, or one that is none."""
         yield from super().contradictions()
-        if not self.drawn:
+        if not self.by_view:
             yield (), "give left, right or both: the corners of the region that the obstacle covers there"
-        for name, corners in self.drawn.items():
+        for name, corners in self.by_view.items():
             if what := _not_simple(corners):
                 yield (name,), what
 
-    @property
-    def drawn(self) -> dict[str, _Polygon]:
-        """Its polygons by the names of the views in which it is drawn."""
-        each = {"left": self.left, "right": self.right, **(self.model_extra or {})}
-        return {name: corners for name, corners in each.items() if corners is not None}
-
     def polygons(self, view: Sequence[str]) -> list[_Polygon | None]:
         """Its polygon in each of the views, None for none. Raises InputError for another name."""
-        if unknown := [name for name in self.drawn if name not in view]:
+        if unknown := [name for name in self.by_view if name not in view]:
             raise InputError(f"trajectory.keep_out: {unknown[0]} is no view; the views are {', '.join(view)}")
-        return [self.drawn.get(name) for name in view]
+        return [self.by_view.get(name) for name in view]
 
 
 def _not_simple(corners: Sequence[Vector2]) -> str:
