@@ -338,7 +338,7 @@ class Config(Settings):
         InputError
             With a line for each value that does not fit, as for ``--set``.
         """
-        return overridden(self, overrides_of("replace", values))
+        return overridden(self, _replacements(values))
 
     def pose(self, q: npt.ArrayLike) -> FloatArray:
         """Return the true pose of the simulated arm's tool in its base frame, before any calibration.
@@ -455,10 +455,10 @@ def shipped(name: pathlib.Path | str) -> pathlib.Path:
     return folder / f"{name}.yaml"
 
 
-def overrides_of(what: str, values: Mapping[str, Any]) -> list["Override"]:
-    """Values as overrides that messages call by ``what``: mappings merge, a key with dots sets its value."""
+def _replacements(values: Mapping[str, Any]) -> list[Override]:
+    """Values as overrides: mappings merge, a key with dots sets its value."""
     return [
-        Override(_shortened(f"{what}: {key}={usual!r}"), key, usual)
+        Override(_shortened(f"replace: {key}={usual!r}"), key, usual)
         for name, value in ((str(key), value) for key, value in values.items())
         for key, usual in ([(name, plain(value))] if "." in name else _leaves(name, value))
     ]
@@ -473,7 +473,7 @@ def _leaves(key: str, value: Any) -> Iterator[tuple[str, Any]]:
         yield from _leaves(f"{key}.{inner}", one)
 
 
-def to_goals(what: str, goals: Sequence[str]) -> list["Override"]:
+def to_goals(what: str, goals: Sequence[str]) -> list[Override]:
     """Return overrides that messages call by ``what``: to goals of some names, one after the other."""
     names = [goal.removesuffix(".yaml") for goal in goals]
     steps = [{"to": name} for name in names] if len(names) > 1 else []
