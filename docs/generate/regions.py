@@ -155,6 +155,15 @@ def verdicts() -> Iterator[str]:
     yield from python.markdown(inspect.cleandoc(loop_verdicts.__doc__ or "").split("\n\n", 1)[1])
 
 
+def terms_of_verdicts() -> Iterator[str]:
+    """The verdicts as terms of the glossary."""
+    rows = (
+        (name, text(one.when), ", ".join(f"`{each}`" for each in (name, *one.names)), one.origin)
+        for name, one in VERDICTS.items()
+    )
+    yield from table(("term", "meaning", "names", "origin"), rows)
+
+
 def findings() -> Iterator[str]:
     """All findings by their codes with their sentences; values that depend on the finding are in italics."""
     rows = ((f"`{code}`", _pattern(row.sentence), _pattern(row.remedy)) for code, row in ROWS.items())
@@ -181,6 +190,7 @@ WRITERS: dict[str, Callable[[], Iterator[str]]] = {
     "laws": laws,
     "modes": modes,
     "verdicts": verdicts,
+    "terms-of-verdicts": terms_of_verdicts,
     "findings": findings,
     "python-interface": python.python_interface,
     "robot-contract": python.robot_contract,

@@ -23,10 +23,21 @@ from projservo_cli.words.reasons import VERDICTS
 
 RUNNING = -1
 WAITING = -3  # for lost markers; no verdict of a run
-BEHIND_CAMERA, OUT_OF_VIEW, MARKERS_LOST, CONVERGED, DIVERGED, SINGULAR_VERDICT = range(6)
-NO_PROGRESS, MAX_STEPS, JOINT_LIMIT, FAULT_DETECTED, FAILED, FOLLOWING_ERROR, OBJECT_MOVED = range(6, 13)
-INTERRUPTED = 13
 VERDICT_NAMES = tuple(VERDICTS)
+BEHIND_CAMERA = VERDICT_NAMES.index("behind camera")
+OUT_OF_VIEW = VERDICT_NAMES.index("out of view")
+MARKERS_LOST = VERDICT_NAMES.index("markers lost")
+CONVERGED = VERDICT_NAMES.index("converged")
+DIVERGED = VERDICT_NAMES.index("diverged")
+SINGULAR_VERDICT = VERDICT_NAMES.index("singular")
+NO_PROGRESS = VERDICT_NAMES.index("no progress")
+MAX_STEPS = VERDICT_NAMES.index("max steps")
+JOINT_LIMIT = VERDICT_NAMES.index("joint limit")
+FAULT_DETECTED = VERDICT_NAMES.index("fault detected")
+FAILED = VERDICT_NAMES.index("failed")
+FOLLOWING_ERROR = VERDICT_NAMES.index("following error")
+OBJECT_MOVED = VERDICT_NAMES.index("object moved")
+INTERRUPTED = VERDICT_NAMES.index("interrupted")
 PLATEAU_FALL = 0.01
 # Joint steps below this, rad or m, are none.
 _NO_MOTION = 1e-6

@@ -10,6 +10,8 @@ class Verdict(NamedTuple):
 
     when: str  # cause
     remedy: str
+    origin: str = "projservo"  # of the term, as the glossary names it
+    names: tuple[str, ...] = ()  # of keys of the configuration and of values that are about it
     arrived: bool = False  # the goal is reached
     stopped: str = ""  # what stopped a law, for which another path is searched
     ends: bool = False  # nothing is driven after it, in this call
@@ -17,44 +19,74 @@ class Verdict(NamedTuple):
     retried: bool = False  # a stored run is made again
 
 
-# In the order of the codes of the loop; the last two are of sweeps.
+# Codes of the loop are the places; the last two are of sweeps.
 VERDICTS = {
-    "behind camera": Verdict("a marker is not in front of a camera", "choose another goal or start"),
+    "behind camera": Verdict(
+        "a marker is not in front of a camera", "choose another goal or start", origin="field"
+    ),
     "out of view": Verdict(
-        "a marker is outside an image, and stop.image_border is stop", "plan a path that keeps it inside"
+        "a marker is outside an image, and plant.image_border is stop",
+        "plan a path that keeps it inside",
+        origin="field",
+        names=("image_border", "first_outside_image"),
     ),
     "markers lost": Verdict(
-        "the law needs a marker that was not seen", "look what covers it, and at light and exposure"
+        "the law needs a marker that was not seen for too many periods",
+        "look what covers it, and at light and exposure",
+        names=("max_lost_periods",),
     ),
-    "converged": Verdict("the image error is within the tolerance", "", arrived=True),
+    "converged": Verdict(
+        "the image error is within the tolerance", "", origin="field", names=("stop",), arrived=True
+    ),
     "diverged": Verdict(
         "the image error or the distance of the face grew by a factor, or the command is not finite",
         "follow a plan, or take another law",
+        origin="field",
+        names=("diverged_factor",),
         stopped="growing errors",
     ),
     "singular": Verdict(
-        "the joint motion of the law is not unique", "follow a plan around it", stopped="a singularity"
+        "the joint motion of the law is not unique",
+        "follow a plan around it",
+        origin="field",
+        stopped="a singularity",
     ),
     "no progress": Verdict(
-        "the error fell by less than 1 % in the last window", "follow a plan, or raise speeds"
+        "the error fell by less than 1 % in the last window, or the robot is stalled",
+        "follow a plan, or raise speeds",
+        origin="field",
+        names=("stall_periods",),
     ),
-    "max steps": Verdict("no step is left", "raise stop.max_steps, or control.gain"),
+    "max steps": Verdict(
+        "no step is left", "raise stop.max_steps, or control.gain", origin="field", names=("max_steps",)
+    ),
     "joint limit": Verdict(
-        "a joint stands at its limit, the command would take it beyond, and stop.joint_limits is stop",
+        "a joint stands at its limit, the command would take it beyond, and plant.joint_limits is stop",
         "follow a plan that keeps the limits",
+        origin="field",
+        names=("joint_limits", "first_beyond_limit"),
         stopped="a joint limit",
     ),
     "fault detected": Verdict(
         "images contradict the calibration, or the tool presses too hard",
         "put back what moved, or calibrate again",
+        origin="field (Isermann)",
         refutes=True,
     ),
     "failed": Verdict(
-        "law, robot or cameras failed during the run", "mend what failed", ends=True, retried=True
+        "law, robot or cameras raised an error, were late, or gave an unusable answer",
+        "mend what failed",
+        ends=True,
+        retried=True,
     ),
-    "following error": Verdict("a joint stays off its set-point", "look whether it is blocked"),
+    "following error": Verdict(
+        "a joint stays too far off its set-point", "look whether it is blocked", origin="field (drives)"
+    ),
     "object moved": Verdict(
-        "the object that carries the goal moved", "let it lie still, and plan again", ends=True
+        "the object that carries the goal moved",
+        "let it lie still, and plan again",
+        names=("object_moved",),
+        ends=True,
     ),
     "interrupted": Verdict(
         "somebody ended it, as with Ctrl-C; its trace up to there is kept", "", ends=True, retried=True
