@@ -17,6 +17,7 @@ from projservo_cli.cli.equations import REGISTER
 from projservo_cli.config.schema import json_schema, sweep_schema
 from projservo_cli.laws import INCIDENCES, LAW_SPECS, MODES, POINT_LAWS
 from projservo_cli.loop import verdicts as loop_verdicts
+from projservo_cli.report.figures import FIGURES
 from projservo_cli.sweeps.runs import BETWEEN, NUMBERED, measured_columns
 from projservo_cli.words import ROWS
 from projservo_cli.words.reasons import VERDICTS
@@ -143,6 +144,12 @@ def modes() -> Iterator[str]:
     yield from table(("mode (`control.mode`)", "action", "laws"), rows)
 
 
+def figures() -> Iterator[str]:
+    """The figures of a report, what each shows, and the figure of the paper that it follows."""
+    rows = ((f"`{spec.name}`", text(spec.title), text(spec.paper)) for spec in FIGURES)
+    yield from table(("figure", "shows", "in the paper"), rows)
+
+
 def verdicts() -> Iterator[str]:
     """All verdicts of a run, and their order."""
     rows = []
@@ -189,6 +196,7 @@ WRITERS: dict[str, Callable[[], Iterator[str]]] = {
     "equations": equations,
     "laws": laws,
     "modes": modes,
+    "figures": figures,
     "verdicts": verdicts,
     "terms-of-verdicts": terms_of_verdicts,
     "findings": findings,

@@ -16,6 +16,7 @@ from docs.generate.regions import GROUPS
 from projservo_cli import cli
 from projservo_cli.config import load_config
 from projservo_cli.report import animation as film
+from projservo_cli.report.figures import FIGURES
 from projservo_cli.simulation.mjcf import mujoco
 from projservo_cli.words.table import ROWS
 from tests.configured import draw_only, truth_of
@@ -228,7 +229,10 @@ def check_teach(folder, names, read):
 
 
 def check_paper(folder, names, read):
-    """The table of claims is that of the reports: each claim, and on which benchmark it holds."""
+    """The table of claims is that of the reports: each claim, and on which benchmark it holds.
+
+    Its figures are those of the paper.
+    """
     text = PAGES["reproduce-the-paper"].read_text(encoding="utf-8")
     rows = [[cell.strip(" *") for cell in line.split("|")] for line in text.splitlines()]
     rows = [row for row in rows if len(row) == 7]
@@ -239,7 +243,8 @@ def check_paper(folder, names, read):
         holds = {claim["claim"]: {True: "yes", False: "no", None: "–"}[claim["holds"]] for claim in claims}
         assert {claim: cell and cell[0] for claim, cell in told.items()} == holds
     figures = set(re.findall(r"`(fig\d\d_\w+)`", text))
-    assert figures == {path.stem for path in Path("results/paper/figures").glob("*.svg")}
+    assert figures == {spec.name for spec in FIGURES if spec.paper.startswith("Fig.")}
+    assert figures <= {path.stem for path in Path("results/paper/figures").glob("*.svg")}
 
 
 HAS = {
@@ -262,8 +267,8 @@ CHECK = {
     "run-file": check_run_file,
     "teach-a-goal": check_teach,
 }
-# Those that pages name; README draws all.
-FIGURES = {"python": ("fig21_runs",), "read-a-report": ("fig01_partition",)}
+# Figures that pages name; README draws all.
+NAMED = {"python": ("fig21_runs",), "read-a-report": ("fig01_partition",)}
 NEEDS = {"run-file": ("xarray", "h5netcdf"), "benchmark-a-law": ("xarray",), "read-a-report": ("plotly",)}
 
 
@@ -279,7 +284,7 @@ def test_page(request, folder, name, capsys, monkeypatch):
         shutil.copytree(request.getfixturevalue("first_chain"), folder / "results" / "paper")
     monkeypatch.setattr(os, "cpu_count", lambda: 1)  # other processes would import all anew
     monkeypatch.setattr(film, "_FRAMES", 6)
-    draw_only(monkeypatch, *FIGURES.get(name, ("fig13_calibration", "fig18_metric")))
+    draw_only(monkeypatch, *NAMED.get(name, ("fig13_calibration", "fig18_metric")))
     for put in HAS.get(name, ()):
         put(folder)
 

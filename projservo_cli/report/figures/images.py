@@ -422,7 +422,7 @@ def _of_features(report_data: Driven | ReportData) -> bool:
 @registered(
     "fig19_incidences",
     "Incidences in the images, and their errors",
-    "no figure",
+    "not in the paper",
     _data_incidences,
     shows=(_of_features, "the goal is a whole pose"),
     alt="Above, for each camera: the features of the tool at the start and at the end of a run, those of the "
@@ -512,7 +512,7 @@ def _of_motions(report_data: Driven | ReportData) -> bool:
 @registered(
     "fig20_sequence",
     "Image errors of the motions of a sequence",
-    "no figure",
+    "not in the paper",
     _data_sequence,
     height=3.2,
     shows=(_of_motions, "the task is one motion"),
@@ -565,7 +565,7 @@ def _carried(report_data: Driven | ReportData) -> bool:
 @registered(
     "fig22_object",
     "The object of the goal, and the goal carried along",
-    "no figure",
+    "not in the paper",
     _data_object,
     shows=(_carried, "no object carries the goal"),
     alt="For each camera: the tags of the object when the goal was taught and now, the displacement of each "
