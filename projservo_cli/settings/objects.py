@@ -16,6 +16,7 @@ from projservo_cli.settings.sections import Note, OneOf, Positive, Section, Vect
 
 WORLD_AND_TOOL = ("scene", "tool")
 """What a feature moves with besides objects, whose names they cannot be."""
+_MOST = Field(max_length=250)  # tags
 _LEAST = 3  # markers that show how an object is turned
 
 
@@ -31,14 +32,13 @@ def _kind(tags: Any) -> str | None:
 
 
 _Tags = Annotated[
-    Annotated[tuple[Whole, ...], Kind(_NUMBERS)] | Annotated[tuple[Tag, ...], Kind(_PLACED)],
+    Annotated[tuple[Whole, ...], _MOST, Kind(_NUMBERS)] | Annotated[tuple[Tag, ...], _MOST, Kind(_PLACED)],
     Discriminator(
         _kind,
         custom_error_type="tags",
         custom_error_message="must be numbers of tags, or {number, size_m, pose} of each where it is "
         "simulated",
     ),
-    Field(max_length=250),
 ]
 
 
