@@ -48,7 +48,7 @@ from projservo_cli.task.incidences import (
     images_of,
     points_of,
 )
-from projservo_cli.task.look_bundle import Look
+from projservo_cli.task.look_bundle import NO_POINTS, Look
 from projservo_cli.task.target import TaskImages
 from projservo_cli.words import text
 from projservo_cli.words.reasons import VERDICTS, arrived
@@ -291,7 +291,7 @@ def _incidence_errors(run: LawRun, images: TaskImages, H: FloatArray, taught: Fl
             [images.goal.incidences[k] for k in own],
         )
         shown = all(one.shown_by(range(len(markers))) for one in asked)
-        points = None if shown else markers_now(world.calibration, objects[carrier - 1])
+        points = NO_POINTS if shown else markers_now(world.calibration, objects[carrier - 1])
         ends = TaughtAndNow(goal, now, taught[own[0]], H, *more, points)
         found[:, own] = incidence_errors(world.calibration, markers, asked, ends, world.inputs.lengths)
     return IncidenceErrors(*found)

@@ -262,8 +262,7 @@ def scenario_of(inputs: PlanInputs, calibration: Calibration) -> Scenario:
     Raises InputError if a part of it is missing, naming the key to set; WorkFailed if the goal cannot be
     reached or seen, or the body not be measured with.
     """
-    if (task := inputs.task) is None:
-        raise InputError("this stage needs a task: set task.start and task.goal")
+    task = inputs.required_task
     world = world_of(inputs, calibration)
     if inputs.incidences:
         world.require_body("incidences are measured")

@@ -283,10 +283,17 @@ class PlanInputs:
     incidences: tuple[Incidence, ...] = ()
     # Width and height to which recorded images reach at least, px, where their size is not known.
     seen_px: ImageSize | None = None
-    # Object that the goal was taught on; None for a goal that stands still.
+    # Objects that the goal was taught on; none for a goal that stands still.
     carriers: "tuple[CarryingObject, ...]" = ()
     displaced: StandOff | None = None  # of the goal, or of the start in its place
     q_current: FloatArray | None = None  # (n,) joints where the arm stands, rad or m, once that is known
+
+    @property
+    def required_task(self) -> TaskSettings:
+        """Return the task. Raises InputError without one, naming the keys to set."""
+        if self.task is None:
+            raise InputError("this stage needs a task: set task.start and task.goal")
+        return self.task
 
     def cameras_at(self, q: FloatArray) -> FloatArray | None:
         """Cameras (V, 3, 4) from the base frame at joints (n,), rad or m, px; None if not described."""

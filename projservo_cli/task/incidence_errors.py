@@ -16,7 +16,7 @@ from projservo_cli.metric.frame import changes_of
 from projservo_cli.monitoring.accuracy import metres_by
 from projservo_cli.records import MEET, MM, PARALLEL, PERPENDICULAR, Calibration, FloatArray, WorkFailed
 from projservo_cli.task.incidences import Flat, Incidence
-from projservo_cli.task.look_bundle import BundleFit, Look, LookRig, UncertainPoints
+from projservo_cli.task.look_bundle import NO_POINTS, BundleFit, Look, LookRig, UncertainPoints
 
 # Angle between features, rad, by their relation.
 _WANTED = {MEET: 0.0, PARALLEL: 0.0, PERPENDICULAR: 0.5 * np.pi}
@@ -84,7 +84,7 @@ class TaughtAndNow(NamedTuple):
     H: FloatArray  # H_taught, H: (4, 4) in the calibrated frame
     taught_mm: float = 0.0
     taught_deg: float = 0.0  # taught_mm, taught_deg: deviation of the goal besides that by its images
-    of_object: UncertainPoints | None = None  # markers of the object that carries the goal, where it is now
+    of_object: UncertainPoints = NO_POINTS  # markers of the object that carries the goal, where it is now
 
 
 class IncidenceErrors(NamedTuple):
@@ -104,7 +104,7 @@ class Placed(NamedTuple):
     E: FloatArray  # (6, 4, 4) generators of steps of them
     unit_mm: FloatArray  # (B,) mm in a unit; 1 where no length is known
     errors: tuple[FloatArray, FloatArray]  # (6, ...) of each displacement, by independent errors
-    of_object: UncertainPoints | None  # markers where they are, whose positions come after those of the body
+    of_object: UncertainPoints  # markers where they are, whose positions come after those of the body
 
     def on_object(self, one: Incidence) -> bool:
         """Whether the feature of the scene is of the markers of the object, and none that was taught."""
@@ -125,7 +125,6 @@ class Placed(NamedTuple):
         tool = _spanning(M, one.tool) @ np.swapaxes(T[..., 1, :, :], -1, -2)
         if not self.on_object(one):
             return tool[..., :3], (_spanning(M, one.scene) @ np.swapaxes(T[..., 0, :, :], -1, -2))[..., :3]
-        assert self.of_object is not None
         own = tuple(tuple(number - M.shape[-2] for number in point) for point in one.scene)
         return tool[..., :3], _spanning(self.of_object.X if X is None else X, own)[..., :3]
 
@@ -141,7 +140,6 @@ class Placed(NamedTuple):
         c = shared.shape[1]  # errors of the calibration come first, and are common
         apart = [self.by_motion(one, 1) @ self.errors[1]]
         if self.on_object(one):
-            assert self.of_object is not None
             errors = np.concatenate([self.of_object.by_calibration, self.of_object.by_images], axis=2)
             apart.append(self.by_points(one) @ errors.reshape(-1, errors.shape[2]))
         else:
@@ -158,7 +156,6 @@ class Placed(NamedTuple):
 
     def by_points(self, one: Incidence) -> FloatArray:
         """Derivatives (c, 3 o) by coordinates of the markers of the object."""
-        assert self.of_object is not None
         X = self.of_object.X
         steps = np.zeros((3 * len(X), *X.shape))
         steps[:, :, :3] = _STEP * np.eye(3 * len(X)).reshape(-1, len(X), 3)

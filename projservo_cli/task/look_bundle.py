@@ -258,6 +258,9 @@ class UncertainPoints(NamedTuple):
     by_calibration: FloatArray  # (k, 3, c)
 
 
+NO_POINTS = UncertainPoints(np.zeros((0, 4)), *np.zeros((2, 0, 3, 0)))
+
+
 @dataclass(frozen=True, eq=False)
 class BundleFit:
     """Points of a body and its displacements at some looks."""

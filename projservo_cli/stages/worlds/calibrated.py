@@ -154,12 +154,11 @@ class CalibratedWorld:
     def _turned(self, q: FloatArray) -> FloatArray:
         """Joints (n,) of a goal that is a turn from joints (n,)."""
         P = self.inputs.cameras_at(q)
-        assert self.inputs.task is not None
         if self.inputs.arm is None or P is None:
             raise InputError(
                 "task.goal.roll_deg needs the model of the robot and its rig: give joints or images instead"
             )
-        return turned(self.inputs.task.goal, self.inputs.arm, P, q)
+        return turned(self.inputs.required_task.goal, self.inputs.arm, P, q)
 
     def true_ends(self, images: TaskImages, q_goal: FloatArray | None) -> Ends:
         """Return the true poses of the tool at the ends of a task; NaN if unknown."""
@@ -278,12 +277,11 @@ class CalibratedWorld:
         Raises WorkFailed, before its first motion, where its images disagree with the calibration.
         """
         assert contract.settle_s is not None
-        assert self.inputs.task is not None
         driven.robot.require_identity(contract.identity)
         if wrong := driven.fits():
             self._stop(driven, "the robot did not move, since at the start", wrong)
         unseen = self._require_images(driven, "the robot did not move, since where it stands", 1, blind=blind)
-        stands = self.inputs.task.start_joints is None and _stands_at(driven, q_start)
+        stands = self.inputs.required_task.start_joints is None and _stands_at(driven, q_start)
         path = path_to(driven.steered, q_start, contract.settle_s, "servo")
         for _ in () if stands else path:
             if wrong := driven.agrees():
