@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from projservo_cli import plugins
 from projservo_cli.chain.making import require_simulated
+from projservo_cli.chain.progress import Listener
 from projservo_cli.config import Config, Override, checked_values, overridden, to_yaml
 from projservo_cli.config.inputs import (
     calibration_inputs,
@@ -24,13 +25,10 @@ from projservo_cli.config.inputs import (
     servo_inputs,
 )
 from projservo_cli.config.sweep import SweepConfig
-from projservo_cli.display import checked_array, numbers_in, require_radians
 from projservo_cli.experiment import Experiment, law_target, plan_scene_of
-from projservo_cli.files import working_in, writing
 from projservo_cli.laws import CODES, REGULATE, law_and_mode, run_name, run_names
 from projservo_cli.loop.compilation import compilation
 from projservo_cli.observations import Observations, require_observations
-from projservo_cli.progress import Listener
 from projservo_cli.records import Calibration, FloatArray, InputError, JointList, Plan
 from projservo_cli.result_hashes import File
 from projservo_cli.results import ImageModel, MotionPlan, RunTrace
@@ -40,8 +38,10 @@ from projservo_cli.stages import calibrate as calibrating
 from projservo_cli.stages import plan as planning
 from projservo_cli.stages import record as recording
 from projservo_cli.stages import servo as driving
-from projservo_cli.stages.external_robot import plugin_robot
 from projservo_cli.stages.stage_inputs import Estimation, RefitInputs, Trials
+from projservo_cli.stages.worlds.external_robot import plugin_robot
+from projservo_cli.store.display import checked_array, numbers_in, require_radians
+from projservo_cli.store.files import working_in, writing
 from projservo_cli.store.run_file import load as stored_run
 from projservo_cli.store.run_file import run_path
 from projservo_cli.store.sweep_table import TABLE, SweepTable

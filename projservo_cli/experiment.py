@@ -12,16 +12,16 @@ import numpy as np
 from projservo_cli import plugins
 from projservo_cli.chain.making import FIGURES, Chain
 from projservo_cli.chain.outdated import STAGES
+from projservo_cli.chain.progress import Listener
 from projservo_cli.config import Config, load_config, overridden, shipped, to_goals
 from projservo_cli.config.inputs import joints_of
-from projservo_cli.display import Printed
-from projservo_cli.files import working_in
 from projservo_cli.image_size import image_sizes
 from projservo_cli.laws import CODES, mode_in
-from projservo_cli.progress import Listener
 from projservo_cli.records import Calibration, InputError, Observation, WorkFailed
 from projservo_cli.results import HeldOutErrors, ImageModel, MotionPlan, PlanScene, RunTrace, WrittenReport
 from projservo_cli.stages import Progress
+from projservo_cli.store.display import Printed
+from projservo_cli.store.files import working_in
 from projservo_cli.store.run_file import Result, Run, stored
 
 

@@ -18,16 +18,6 @@ from projservo_cli.calibration.prediction import (
     prediction_variance,
 )
 from projservo_cli.calibration.refit import refit, since_moved
-from projservo_cli.display import (
-    Displayable,
-    Printed,
-    checked_array,
-    numbers_in,
-    pandas,
-    require_radians,
-    xarray,
-)
-from projservo_cli.files import bytes_of
 from projservo_cli.geometry.kinematics import project as pixels_of
 from projservo_cli.metric.frame import Metric, Scale, links
 from projservo_cli.metric.kinematic_errors import KinematicErrors, in_model_frames, kinematic_errors
@@ -50,6 +40,16 @@ from projservo_cli.records import (
 )
 from projservo_cli.settings.task import Trajectory
 from projservo_cli.simulation.urdf import UrdfChain, urdf_chain
+from projservo_cli.store.display import (
+    Displayable,
+    Printed,
+    checked_array,
+    numbers_in,
+    pandas,
+    require_radians,
+    xarray,
+)
+from projservo_cli.store.files import bytes_of
 from projservo_cli.task.displaced_object import DisplacedObject
 from projservo_cli.task.look_bundle import Look
 

@@ -60,8 +60,8 @@ def reference_truth(shared_data):
 @pytest.fixture(scope="session", autouse=True)
 def quick():
     """Nothing is forced onto the disk, which may take its time; no figure is drawn by another process."""
-    from projservo_cli import files
     from projservo_cli.report import drawing
+    from projservo_cli.store import files
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(files, "_synchronise", lambda path: None)

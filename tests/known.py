@@ -5,7 +5,7 @@ from dataclasses import replace
 from projservo_cli.config import load_config
 from projservo_cli.settings.sections import JointVector
 from projservo_cli.stages.plan import plan_task
-from projservo_cli.stages.run_trace import trace_of
+from projservo_cli.stages.runs.run_trace import trace_of
 from projservo_cli.stages.servo import drive
 from tests.configured import scenario_of, trajectory_of
 from tests.conftest import ROOT

@@ -15,7 +15,7 @@ from projservo_cli.experiment import Experiment
 from projservo_cli.observations import Observations
 from projservo_cli.results import ImageModel, MetricModel
 from projservo_cli.robots.contract import Robot
-from projservo_cli.stages.plugin_law import LawSetup, PluginLaw
+from projservo_cli.stages.runs.plugin_law import LawSetup, PluginLaw
 from projservo_cli.sweeps.statistics import Study
 
 # What Python users call, in the order of a run, and the members of each class.

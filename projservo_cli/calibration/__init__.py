@@ -8,7 +8,7 @@ model, and predicts images and their errors from the result.
 
 from projservo_cli.calibration.checks.quality import WEAK_NOISE
 from projservo_cli.calibration.checks.validation import cross_validate, residual_statistics
-from projservo_cli.calibration.initialization import Nominal
+from projservo_cli.calibration.initial.initialization import Nominal
 from projservo_cli.calibration.pipeline import calibrate
 from projservo_cli.calibration.prediction import predict, prediction_variance
 from projservo_cli.calibration.robust_fit import Solution, chi2_band

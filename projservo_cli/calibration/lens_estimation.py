@@ -7,11 +7,11 @@ from scipy.special import fdtri
 
 from projservo_cli.calibration.bundle_adjustment import LeastSquares
 from projservo_cli.calibration.detections import Detections
-from projservo_cli.calibration.epipolar import Epipolar, ImageFrame, ImageGeometry
-from projservo_cli.calibration.initialization import Search
+from projservo_cli.calibration.initial.epipolar import Epipolar, ImageFrame, ImageGeometry
+from projservo_cli.calibration.initial.initialization import Search
+from projservo_cli.calibration.initial.single_view import RigidBody
 from projservo_cli.calibration.prediction import LENS, Parameters
 from projservo_cli.calibration.robust_fit import Solution, fit_from, left_out_px
-from projservo_cli.calibration.single_view import RigidBody
 from projservo_cli.geometry.lens import before_fold, undistort
 from projservo_cli.records import FloatArray, WorkFailed
 

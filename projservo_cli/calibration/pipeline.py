@@ -41,8 +41,9 @@ from projservo_cli.calibration.detections import (
     require_no_copies,
     require_size_and_noise,
 )
-from projservo_cli.calibration.epipolar import ImageFrame, ImageGeometry
-from projservo_cli.calibration.initialization import Nominal, Progress, Search
+from projservo_cli.calibration.initial.epipolar import ImageFrame, ImageGeometry
+from projservo_cli.calibration.initial.initialization import Nominal, Progress, Search
+from projservo_cli.calibration.initial.views import with_all_views, with_best_pair, with_own_noise
 from projservo_cli.calibration.joint_model import AUTO, Hypothesis, fit_joint_model, hypotheses_of
 from projservo_cli.calibration.lens_estimation import fit_lens, share_explained, undistorted
 from projservo_cli.calibration.prediction import LENS, along_the_arm
@@ -58,7 +59,6 @@ from projservo_cli.calibration.robust_fit import (
     solve,
 )
 from projservo_cli.calibration.time_offset import with_time_offset
-from projservo_cli.calibration.views import with_all_views, with_best_pair, with_own_noise
 from projservo_cli.findings import LIMITS, REFUSES, Finding, Subject, columns
 from projservo_cli.geometry.lens import K1
 from projservo_cli.image_size import ImageSize, border_distance, image_sizes

@@ -29,7 +29,8 @@ from projservo_cli.calibration.detections import (
     per_block,
     per_rad,
 )
-from projservo_cli.calibration.epipolar import OUTLIER
+from projservo_cli.calibration.initial.epipolar import OUTLIER
+from projservo_cli.calibration.initial.views import resected
 from projservo_cli.calibration.prediction import (
     CAMERA,
     Parameters,
@@ -40,7 +41,6 @@ from projservo_cli.calibration.prediction import (
     prediction_variance,
 )
 from projservo_cli.calibration.robust_fit import MAX_PREDICTED, REFUSE_RATIO, inverse_root
-from projservo_cli.calibration.views import resected
 from projservo_cli.findings import LIMITS, NOTE, REFUSES, Finding, Subject
 from projservo_cli.geometry.lens import TERMS, undistort
 from projservo_cli.image_size import ImageSize, image_sizes

@@ -18,11 +18,11 @@ from projservo_cli.calibration.detections import (
     medians,
     per_rad,
 )
-from projservo_cli.calibration.epipolar import OUTLIER, ImageGeometry
-from projservo_cli.calibration.initialization import Nominal, Search, starting_markers, starts
+from projservo_cli.calibration.initial.epipolar import OUTLIER, ImageGeometry
+from projservo_cli.calibration.initial.initialization import Nominal, Search, starting_markers, starts
+from projservo_cli.calibration.initial.triangulation import Tracks
 from projservo_cli.calibration.joint_noise import NO_JOINT_NOISE, JointNoise
 from projservo_cli.calibration.prediction import Parameters
-from projservo_cli.calibration.triangulation import Tracks
 from projservo_cli.findings import LIMITS, REFUSES, Finding, Subject
 from projservo_cli.records import BoolArray, Errors, FloatArray, IntArray, WorkFailed
 from projservo_cli.words import refused

@@ -4,9 +4,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from projservo_cli.chain.progress import Listener
 from projservo_cli.config import Config
 from projservo_cli.config.inputs import joints_of, recording_inputs
-from projservo_cli.progress import Listener
 from projservo_cli.records import InputError, JointList, WorkFailed
 from projservo_cli.result_hashes import digest
 from projservo_cli.store.run_file import Run

@@ -43,8 +43,8 @@ class Steps:
 
     def opened(self, c: Calibration) -> FloatArray:
         """Open the robot of somebody's, unless it is, and return where it stands (n,), rad or m."""
-        from projservo_cli.stages.external_robot import opened_robot
         from projservo_cli.stages.worlds.calibrated import observed_numbers
+        from projservo_cli.stages.worlds.external_robot import opened_robot
 
         inputs = servo_inputs(self.config)
         assert self.session is not None

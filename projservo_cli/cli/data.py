@@ -62,10 +62,10 @@ def _teach(
     """
     from projservo_cli.config import plain_yaml
     from projservo_cli.config.inputs import plan_inputs, teach_inputs
-    from projservo_cli.files import write_whole, writing
     from projservo_cli.records import InputError, WorkFailed
     from projservo_cli.settings.sections import JointVector
     from projservo_cli.stages import teach as stage
+    from projservo_cli.store.files import write_whole, writing
     from projservo_cli.words import line
     from projservo_cli.words.table import Setup
     from projservo_cli.words.values import sharing

@@ -171,7 +171,7 @@ def _export(
         value = {"run": found.path.resolve(), "files": [file.resolve() for file in files]}
         console.report(value, [f"export: {len(files)} files: {folder}"])
         return
-    from projservo_cli.files import write_whole
+    from projservo_cli.store.files import write_whole
 
     if frames == "model" and nominal is None:
         raise click.UsageError("--frames model needs the model: --nominal URDF")
@@ -264,9 +264,9 @@ def _write_tables(run: Any, folder: Path) -> Iterator[Path]:
     """A table that says what every field is, and one for each record."""
     import numpy as np
 
-    from projservo_cli.files import write_whole
     from projservo_cli.findings import sparse
     from projservo_cli.records import flat_fields
+    from projservo_cli.store.files import write_whole
     from projservo_cli.store.observation_tables import to_csv
 
     rows, tables = [], {}

@@ -34,7 +34,7 @@ def _init(console: Console, *, file: Path, arm: str | None, force: bool) -> None
     editors complete and check it.
     """
     from projservo_cli.config.schema import as_text, json_schema, starter
-    from projservo_cli.files import write_whole
+    from projservo_cli.store.files import write_whole
 
     path = file / _STARTER if file.is_dir() else file
     if path.suffix not in (".yaml", ".yml"):
@@ -63,7 +63,7 @@ def _schema(console: Console, *, what: str | None, output: Path | None) -> None:
     yaml-language-server: $schema=FILE. That of sweeps is projservo schema sweep.
     """
     from projservo_cli.config.schema import as_text, json_schema, sweep_schema
-    from projservo_cli.files import write_whole
+    from projservo_cli.store.files import write_whole
 
     schema = sweep_schema() if what else json_schema()
     if output is None:

@@ -10,8 +10,8 @@ from typing import Any
 
 import click
 
+from projservo_cli.chain.progress import Listener
 from projservo_cli.passwords import masked
-from projservo_cli.progress import Listener
 
 _UNSEEN = re.compile("[\x00-\x09\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 _MEASURED = {  # words for the image features of runs
@@ -57,7 +57,7 @@ class Console(Listener):
     def report(self, value: dict[str, Any], lines: Iterable[str]) -> None:
         """Data on standard output: one object of strict JSON in UTF-8, whatever the locale, or in words."""
         if self.as_json:
-            from projservo_cli.display import plain
+            from projservo_cli.store.display import plain
 
             text = visible(
                 json.dumps(plain(value, finite=True), ensure_ascii=False, allow_nan=False, indent=2)

@@ -134,8 +134,8 @@ def _record(stages: Sequence[str], /, console: Console, **options: Any) -> int:
         return _make(console, stages, options)
     from projservo_cli.chain.recordings import data_table, recording_made
     from projservo_cli.config.inputs import recording_inputs
-    from projservo_cli.files import writing
     from projservo_cli.stages.record import new_recording
+    from projservo_cli.store.files import writing
 
     config = option.configured(options["config"], options)
     path = options["output"] or data_table(config)
@@ -318,7 +318,7 @@ def _make(console: Console, names: Sequence[str], options: Mapping[str, Any]) ->
     if options["threads"] is not None:  # read by the compiler's runtime when it is first imported
         os.environ["NUMBA_NUM_THREADS"] = str(options["threads"])
     from projservo_cli.chain.making import FIGURES
-    from projservo_cli.files import tidy, working_in, writing
+    from projservo_cli.store.files import tidy, working_in, writing
 
     chain = _asked(console, names, options)
     if options["dry_run"]:
@@ -450,7 +450,7 @@ def _from_sweep(options: Mapping[str, Any]) -> tuple["Config", "Run"]:
 
 def _run_of(options: Mapping[str, Any], config: "Config") -> "Run":
     """The run where the user says, else in the folder of the configuration's name; empty where none is."""
-    from projservo_cli.files import require_inside
+    from projservo_cli.store.files import require_inside
     from projservo_cli.store.run_file import stored
 
     folder = options["output"]
@@ -556,8 +556,8 @@ def _announce(console: Console, chain: "Chain") -> None:
 
 def _print_sweep(console: Console, sweep: Path, options: Mapping[str, Any]) -> int:
     """Write the report of a sweep and print its tables; the exit code."""
-    from projservo_cli.files import working_in
     from projservo_cli.report.style import FORMATS
+    from projservo_cli.store.files import working_in
     from projservo_cli.sweeps.folder import Folder
     from projservo_cli.sweeps.statistics import report
 

@@ -46,7 +46,7 @@ def _sweep(
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # in the processes to come, from their beginning
     from projservo_cli.config import load_sweep
-    from projservo_cli.files import working_in
+    from projservo_cli.store.files import working_in
     from projservo_cli.store.sweep_table import SweepTable
     from projservo_cli.sweeps.design import read_design
     from projservo_cli.sweeps.engine import Cluster, Engine

@@ -14,7 +14,6 @@ import numpy as np
 
 from projservo_cli.config.loading import Config, stored_yaml
 from projservo_cli.config.whole import carriers_of, truth_of
-from projservo_cli.display import About
 from projservo_cli.records import ANGLE, MEET, PARALLEL, PERPENDICULAR, TOOL, InputError
 from projservo_cli.result_hashes import File
 from projservo_cli.settings.control import LawSettings, Rest, RunConditions, ServoLimits, SpeedLimits
@@ -57,6 +56,7 @@ from projservo_cli.stages.stage_inputs import (
     TeachInputs,
     Trials,
 )
+from projservo_cli.store.display import About
 from projservo_cli.store.observation_tables import identity_in
 from projservo_cli.task.incidences import Incidence
 from projservo_cli.task.stand_off import StandOff

@@ -9,7 +9,6 @@ from typing import Annotated, Any, Self, cast
 import numpy as np
 from pydantic import AfterValidator, Field, StringConstraints
 
-from projservo_cli.display import Printed
 from projservo_cli.image_size import ImageSize
 from projservo_cli.laws import REGULATE
 from projservo_cli.records import LIMITS_MISSING, TOOL, WORLD, InputError, in_unit
@@ -26,6 +25,7 @@ from projservo_cli.settings.trials import CalibrationSettings, Data, Noise
 from projservo_cli.simulation.described import described_truth
 from projservo_cli.simulation.streams import NORMAL, NoiseShape
 from projservo_cli.simulation.workspace import Truth
+from projservo_cli.store.display import Printed
 
 
 def _folder_name(name: str) -> str:

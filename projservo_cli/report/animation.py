@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from markupsafe import Markup
 
-from projservo_cli.files import replacing, write_whole
 from projservo_cli.geometry.kinematics import forward_kinematics
 from projservo_cli.image_size import ImageSize, image_sizes
 from projservo_cli.laws import BODY_LAWS, POINT_LAWS
@@ -30,6 +29,7 @@ from projservo_cli.report.html import html_page
 from projservo_cli.report.report_data import PAGE_FILE, title
 from projservo_cli.simulation.analytic_plant import Plant
 from projservo_cli.simulation.arm import SerialArm
+from projservo_cli.store.files import replacing, write_whole
 from projservo_cli.task.face import center_of
 from projservo_cli.words.reasons import arrived
 

@@ -14,8 +14,6 @@ import numpy as np
 
 from projservo_cli.calibration.checks.quality import WEAK_NOISE
 from projservo_cli.calibration.robust_fit import chi2_band
-from projservo_cli.display import About
-from projservo_cli.files import lies_inside, write_whole
 from projservo_cli.findings import REACH_M, REACH_RAD
 from projservo_cli.laws import must_converge, run_name
 from projservo_cli.records import Plan, Report
@@ -31,6 +29,8 @@ from projservo_cli.report.report_data import (
     title,
 )
 from projservo_cli.report.style import FORMATS
+from projservo_cli.store.display import About
+from projservo_cli.store.files import lies_inside, write_whole
 from projservo_cli.store.run_file import Run
 from projservo_cli.words.reasons import arrived
 

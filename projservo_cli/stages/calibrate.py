@@ -10,13 +10,11 @@ from projservo_cli.calibration.checks.board_numbering import BoardNumbering
 from projservo_cli.calibration.checks.joint_order import undecided_pairs
 from projservo_cli.calibration.checks.screening import screened
 from projservo_cli.calibration.checks.validation import cross_validate
-from projservo_cli.calibration.initialization import Nominal
+from projservo_cli.calibration.initial.initialization import Nominal
 from projservo_cli.calibration.pipeline import calibrate
 from projservo_cli.calibration.refit import refit, since_moved
 from projservo_cli.calibration.robust_fit import Solution
-from projservo_cli.files import write_whole
 from projservo_cli.geometry.lens import K1
-from projservo_cli.nominal import read_nominal
 from projservo_cli.observations import Observations
 from projservo_cli.planning.pose_selection import FARTHER, Suggestion, region_around, suggest
 from projservo_cli.records import (
@@ -41,6 +39,8 @@ from projservo_cli.stages.stage_inputs import (
     Table,
     Trials,
 )
+from projservo_cli.store.files import write_whole
+from projservo_cli.store.nominal import read_nominal
 from projservo_cli.store.observation_tables import mount_in, read_detections, read_table, to_csv
 from projservo_cli.words import lines, with_findings
 from projservo_cli.words.table import Setup

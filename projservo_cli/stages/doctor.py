@@ -26,8 +26,8 @@ from projservo_cli.robots.contract import PluginRobot, at_rest_after
 from projservo_cli.robots.pacing import Steered
 from projservo_cli.robots.standstill import frames_of
 from projservo_cli.stages import Progress, silent
-from projservo_cli.stages.external_robot import plugin_robot
 from projservo_cli.stages.stage_inputs import OwnRobot, PreflightInputs
+from projservo_cli.stages.worlds.external_robot import plugin_robot
 from projservo_cli.words.table import Setup
 
 # Time of observation of a robot at rest, s, and minimum number of readings.

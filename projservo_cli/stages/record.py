@@ -15,7 +15,6 @@ import numpy as np
 from projservo_cli import words
 from projservo_cli.calibration.detections import per_rad
 from projservo_cli.detection import DICTIONARY, MIN_CELL, cells_of
-from projservo_cli.files import write_whole
 from projservo_cli.findings import NOTE, REFUSES, Finding, Subject
 from projservo_cli.hardware.checks_at_rest import MIN_SHARED
 from projservo_cli.records import (
@@ -38,8 +37,9 @@ from projservo_cli.simulation.faults import robot_by_itself
 from projservo_cli.simulation.streams import CALIBRATION_NOISE, POSE_NOISE, TRIAL_POSES, generator
 from projservo_cli.simulation.workspace import Truth
 from projservo_cli.stages import Progress, silent
-from projservo_cli.stages.external_robot import path_to, plugin_robot, simulated_robot
 from projservo_cli.stages.stage_inputs import OwnRobot, RecordingInputs, Trials
+from projservo_cli.stages.worlds.external_robot import path_to, plugin_robot, simulated_robot
+from projservo_cli.store.files import write_whole
 from projservo_cli.store.observation_tables import identity_in, read_table, recording_of, write_table
 from projservo_cli.words.table import Setup
 

@@ -14,7 +14,6 @@ from scipy.spatial.transform import Rotation
 
 from projservo_cli import provenance
 from projservo_cli.control.law import Gains
-from projservo_cli.files import replacing, require_inside, write_whole
 from projservo_cli.geometry.algebra import as_array, mat
 from projservo_cli.geometry.displacements import (
     composed_angle,
@@ -50,10 +49,11 @@ from projservo_cli.simulation.workspace import Truth, plant_of
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.carried_goals import in_metres
 from projservo_cli.stages.plan import plan_task
-from projservo_cli.stages.run_trace import trace_of
+from projservo_cli.stages.runs.run_trace import trace_of
 from projservo_cli.stages.scenario import RunScenario, run_scenario
 from projservo_cli.stages.servo import drive
 from projservo_cli.stages.stage_inputs import ReportInputs, Scenery, ServoInputs
+from projservo_cli.store.files import replacing, require_inside, write_whole
 from projservo_cli.store.observation_tables import to_csv
 from projservo_cli.store.run_file import Result, Run
 from projservo_cli.task.body import make_body

@@ -16,8 +16,8 @@ from projservo_cli.records import (
     WorkFailed,
 )
 from projservo_cli.simulation.analytic_plant import AnalyticPlant
-from projservo_cli.stages.law_run import LawRun
-from projservo_cli.stages.run_trace import trace_of
+from projservo_cli.stages.runs.law_run import LawRun
+from projservo_cli.stages.runs.run_trace import trace_of
 from projservo_cli.stages.scenario import RunScenario, run_scenario
 from projservo_cli.stages.stage_inputs import ServoInputs
 

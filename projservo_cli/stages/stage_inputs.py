@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from projservo_cli.detection import Board
-from projservo_cli.display import About
 from projservo_cli.image_size import ImageSize
 from projservo_cli.records import TOOL, Calibration, FloatArray, InputError, JointLimits
 from projservo_cli.result_hashes import File, digest, encoded
@@ -34,6 +33,7 @@ from projservo_cli.simulation.arm import SerialArm
 from projservo_cli.simulation.faults import SimulatedRobot
 from projservo_cli.simulation.rendering import RenderedScene
 from projservo_cli.simulation.workspace import SceneObject, Truth
+from projservo_cli.store.display import About
 from projservo_cli.task.incidences import Incidence
 from projservo_cli.task.stand_off import StandOff
 

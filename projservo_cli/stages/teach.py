@@ -11,7 +11,6 @@ import numpy as np
 from projservo_cli import words
 from projservo_cli.calibration.checks.validation import of_views
 from projservo_cli.calibration.prediction import predict
-from projservo_cli.display import require_radians
 from projservo_cli.findings import LIMITS, REFUSES, Finding, Subject
 from projservo_cli.hardware.checks_at_rest import MIN_SHARED
 from projservo_cli.image_size import image_sizes
@@ -33,9 +32,10 @@ from projservo_cli.settings.task import Goal, GoalImages, TaskSettings, sigma_ke
 from projservo_cli.simulation.faults import FaultyRobot, SimulatedRobot, robot_by_itself
 from projservo_cli.simulation.streams import TAUGHT_NOISE, generator
 from projservo_cli.stages import plan as planning
-from projservo_cli.stages.external_robot import plugin_robot, simulated_robot, takes_limits
 from projservo_cli.stages.record import shared_markers
 from projservo_cli.stages.stage_inputs import OwnRobot, PlanInputs, TeachInputs
+from projservo_cli.stages.worlds.external_robot import plugin_robot, simulated_robot, takes_limits
+from projservo_cli.store.display import require_radians
 from projservo_cli.task.displaced_object import RIGID
 from projservo_cli.words.table import Setup
 

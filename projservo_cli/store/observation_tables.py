@@ -24,7 +24,6 @@ import numpy as np
 import numpy.typing as npt
 
 from projservo_cli.calibration.time_offset import require_seconds
-from projservo_cli.files import lines_of, write_whole
 from projservo_cli.image_size import view_named, views_in_order
 from projservo_cli.metric.position_error import Positions
 from projservo_cli.records import (
@@ -40,6 +39,7 @@ from projservo_cli.records import (
     JointList,
     Observation,
 )
+from projservo_cli.store.files import lines_of, write_whole
 
 _MAX_JOINTS = 64  # maximum number of joints, as in a configuration
 _MAX_COLUMNS = 10_000  # maximum number of columns

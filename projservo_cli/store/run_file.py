@@ -29,7 +29,6 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import TypeAdapter, ValidationError
 
-from projservo_cli.files import replacing
 from projservo_cli.findings import LIMITS, NOTE, REFUSES, Finding, of_columns, sparse, told
 from projservo_cli.records import (
     SIZES,
@@ -52,6 +51,7 @@ from projservo_cli.records import (
     part_of,
     scalars_of,
 )
+from projservo_cli.store.files import replacing
 from projservo_cli.words import line, sentence, setup_of
 from projservo_cli.words.reasons import arrived
 

@@ -21,7 +21,6 @@ from projservo_cli import provenance
 from projservo_cli.chain.outdated import inputs_of, result_of, steps_for
 from projservo_cli.config import Config, stored_yaml
 from projservo_cli.config.inputs import servo_inputs
-from projservo_cli.files import write_whole
 from projservo_cli.geometry.jit import CACHE_FOLDER, is_cached
 from projservo_cli.laws import codes_of
 from projservo_cli.loop.batch import until_rehearsal
@@ -29,6 +28,7 @@ from projservo_cli.loop.compiled import run_compiled
 from projservo_cli.loop.jit_warmup import are_cached
 from projservo_cli.records import Calibration, CrossValidation, InputError, Observation, WorkFailed
 from projservo_cli.stages import Progress, calibrate
+from projservo_cli.store.files import write_whole
 from projservo_cli.store.run_file import Result, Run, load, save
 from projservo_cli.store.sweep_table import TABLE, SweepTable, assemble, write_part
 from projservo_cli.sweeps.design import Design, name_of_run

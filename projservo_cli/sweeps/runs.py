@@ -28,7 +28,7 @@ from projservo_cli.records import (
 from projservo_cli.result_hashes import key_of
 from projservo_cli.stages import plan as planning
 from projservo_cli.stages.plan import rotation_sense
-from projservo_cli.stages.run_trace import trace_of
+from projservo_cli.stages.runs.run_trace import trace_of
 from projservo_cli.stages.scenario import RunScenario, run_scenario
 from projservo_cli.stages.servo import drive, sense_is_enough
 from projservo_cli.stages.stage_inputs import PlanInputs, ServoInputs

@@ -15,13 +15,13 @@ import numpy.typing as npt
 from scipy.stats import binomtest
 
 from projservo_cli.config.sweep import LAW
-from projservo_cli.display import Displayable, pandas, xarray
-from projservo_cli.files import write_whole
 from projservo_cli.records import BoolArray, InputError
 from projservo_cli.report import style
 from projservo_cli.report.figures.sweep_success import draw_basin, pictures, wilson_interval
 from projservo_cli.results import RunTrace
 from projservo_cli.stages import Progress
+from projservo_cli.store.display import Displayable, pandas, xarray
+from projservo_cli.store.files import write_whole
 from projservo_cli.store.observation_tables import to_csv
 from projservo_cli.store.sweep_table import Failure, SweepTable
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from projservo_cli.calibration.detections import Detections
-from projservo_cli.calibration.epipolar import (
+from projservo_cli.calibration.initial.epipolar import (
     Epipolar,
     ImageFrame,
     log_distances,

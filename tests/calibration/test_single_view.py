@@ -6,8 +6,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from projservo_cli.calibration.detections import Detections
-from projservo_cli.calibration.epipolar import ImageFrame
-from projservo_cli.calibration.single_view import RigidBody
+from projservo_cli.calibration.initial.epipolar import ImageFrame
+from projservo_cli.calibration.initial.single_view import RigidBody
 from projservo_cli.records import Observation, WorkFailed
 from projservo_cli.settings.markers import Markers
 from tests.calibration.simulated_robot import around, random_robot, trials

@@ -8,7 +8,7 @@ import pytest
 
 from projservo_cli.calibration import calibrate, cross_validate, predict, prediction_variance
 from projservo_cli.calibration.detections import Detections
-from projservo_cli.calibration.epipolar import Epipolar
+from projservo_cli.calibration.initial.epipolar import Epipolar
 from projservo_cli.records import WorkFailed
 from tests.calibration.bound import Bound
 from tests.calibration.simulated_robot import around, random_robot, trials

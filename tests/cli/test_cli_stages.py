@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from tqdm import tqdm
 
-from projservo_cli import progress
+from projservo_cli.chain import progress
 from projservo_cli.cli.output import Console
 from projservo_cli.report import animation as film
 from projservo_cli.report import page

@@ -10,7 +10,7 @@ from projservo_cli.planning.rrt_connect import margins_at
 from projservo_cli.simulation.arm import METRIC_A_INF
 from projservo_cli.stages.motions import search_of
 from projservo_cli.stages.plan import plan_task
-from projservo_cli.stages.run_trace import trace_of
+from projservo_cli.stages.runs.run_trace import trace_of
 from projservo_cli.stages.servo import drive
 from tests.configured import calibrate, scenario_of
 from tests.known import configured

@@ -10,7 +10,7 @@ import pytest
 from projservo_cli.config import load_config
 from projservo_cli.robots.contract import PluginRobot, at_rest_after
 from projservo_cli.robots.pacing import Steered
-from projservo_cli.stages.external_robot import path_to
+from projservo_cli.stages.worlds.external_robot import path_to
 from tests.configured import bounds_of, joints_of, robot_by_itself, truth_of
 from tests.documentation.blocks import PAGES, ROOT, blocks_of
 from tests.documentation.test_pages import put_truth

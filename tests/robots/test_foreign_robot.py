@@ -13,7 +13,7 @@ from projservo_cli.records import JointLimits, WorkFailed
 from projservo_cli.robots import contract
 from projservo_cli.robots.contract import Bounds, PluginRobot, at_rest_after
 from projservo_cli.robots.pacing import Steered
-from projservo_cli.stages.external_robot import path_to
+from projservo_cli.stages.worlds.external_robot import path_to
 
 PERIOD = 0.04
 BOUNDS = Bounds(

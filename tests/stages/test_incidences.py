@@ -12,8 +12,8 @@ from projservo_cli.report.animation import motion_of
 from projservo_cli.report.figures.scene import features_in_space
 from projservo_cli.report.report_data import REGISTER, Driven
 from projservo_cli.simulation.workspace import plant_of
-from projservo_cli.stages.plugin_law import PluginLaw
-from projservo_cli.stages.run_trace import trace_of
+from projservo_cli.stages.runs.plugin_law import PluginLaw
+from projservo_cli.stages.runs.run_trace import trace_of
 from projservo_cli.stages.scenario import run_scenario
 from projservo_cli.stages.servo import drive
 from tests.configured import calibrate, plan, servo, servo_inputs, truth_of

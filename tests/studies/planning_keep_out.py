@@ -27,7 +27,7 @@ from projservo_cli.settings.task import KeptOut
 from projservo_cli.simulation.arm import METRIC_A_INF
 from projservo_cli.simulation.random_tasks import random_tasks
 from projservo_cli.simulation.workspace import Truth
-from projservo_cli.stages.run_trace import trace_of
+from projservo_cli.stages.runs.run_trace import trace_of
 from projservo_cli.stages.servo import drive
 from projservo_cli.stages.worlds.simulated import SimulatedWorld
 from projservo_cli.task.target import Goal, TaskImages

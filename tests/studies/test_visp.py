@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from projservo_cli.stages.run_trace import trace_of
+from projservo_cli.stages.runs.run_trace import trace_of
 from projservo_cli.stages.servo import drive
 from tests.configured import calibrate, plan, scenario_of, truth_of
 from tests.known import configured

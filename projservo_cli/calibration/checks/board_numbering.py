@@ -13,9 +13,9 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 
 from projservo_cli.calibration.detections import Detections, even_choice
-from projservo_cli.calibration.epipolar import Epipolar
+from projservo_cli.calibration.initial.epipolar import Epipolar
+from projservo_cli.calibration.initial.single_view import moved_plane
 from projservo_cli.calibration.prediction import predict
-from projservo_cli.calibration.single_view import moved_plane
 from projservo_cli.findings import LIMITS, Finding, Subject
 from projservo_cli.geometry.displacements import homogeneous
 from projservo_cli.records import (

@@ -10,8 +10,8 @@ from scipy.optimize import linear_sum_assignment
 from scipy.sparse.csgraph import connected_components
 
 from projservo_cli.calibration.detections import Detections, beginning_in
-from projservo_cli.calibration.epipolar import OUTLIER, Epipolar, ImageFrame, ImageGeometry, sampson
-from projservo_cli.calibration.single_view import RigidBody
+from projservo_cli.calibration.initial.epipolar import OUTLIER, Epipolar, ImageFrame, ImageGeometry, sampson
+from projservo_cli.calibration.initial.single_view import RigidBody
 from projservo_cli.findings import REFUSES, Finding, Subject
 from projservo_cli.geometry.displacements import homogeneous
 from projservo_cli.image_size import FACTORS

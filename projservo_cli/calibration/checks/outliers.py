@@ -14,8 +14,8 @@ from projservo_cli.calibration.bundle_adjustment import LeastSquares, fit_offset
 from projservo_cli.calibration.checks.model_error import image_motions
 from projservo_cli.calibration.checks.other_poses import EXPLAINED, MOSTLY, SEEN_OF_IMAGE, shown_poses
 from projservo_cli.calibration.detections import RAYLEIGH, Detections
-from projservo_cli.calibration.epipolar import OUTLIER
-from projservo_cli.calibration.initialization import stationary
+from projservo_cli.calibration.initial.epipolar import OUTLIER
+from projservo_cli.calibration.initial.initialization import stationary
 from projservo_cli.calibration.prediction import Parameters
 from projservo_cli.calibration.robust_fit import Solution, median_px
 from projservo_cli.findings import LIMITS, Finding, Subject

@@ -12,7 +12,7 @@ from projservo_cli.calibration.checks.outliers import MAX_OF_POSE, Outliers, fit
 from projservo_cli.calibration.checks.quality import check_model
 from projservo_cli.calibration.checks.validation import cross_validate
 from projservo_cli.calibration.detections import beginning_in
-from projservo_cli.calibration.epipolar import ImageGeometry
+from projservo_cli.calibration.initial.epipolar import ImageGeometry
 from projservo_cli.calibration.lens_estimation import undistorted
 from projservo_cli.calibration.robust_fit import Expected, Solution
 from projservo_cli.findings import REFUSES, Finding, Subject

@@ -18,7 +18,7 @@ from projservo_cli.calibration.checks.numbering import size_changes
 from projservo_cli.calibration.checks.outliers import Outliers
 from projservo_cli.calibration.checks.refusal import unexplained
 from projservo_cli.calibration.detections import Detections, even_choice
-from projservo_cli.calibration.initialization import Search, bodies, starting_markers, starts
+from projservo_cli.calibration.initial.initialization import Search, bodies, starting_markers, starts
 from projservo_cli.calibration.robust_fit import Solution, fit_from
 from projservo_cli.findings import REFUSES, Finding, Subject
 from projservo_cli.records import TOOL, WORLD, FloatArray, WorkFailed, letters_of

@@ -13,7 +13,7 @@ from projservo_cli.calibration.checks.board_numbering import BoardNumbering
 from projservo_cli.calibration.checks.quality import UNDETERMINED_NOISE
 from projservo_cli.calibration.checks.screening import without_placeholders
 from projservo_cli.calibration.detections import SAME_READING, Detections, per_rad, require_motion
-from projservo_cli.calibration.epipolar import Epipolar
+from projservo_cli.calibration.initial.epipolar import Epipolar
 from projservo_cli.calibration.prediction import joint_derivative, predict, prediction_variance
 from projservo_cli.calibration.robust_fit import WARN_RATIO, Solution, fit_inliers
 from projservo_cli.findings import LIMITS, NOTE, REFUSES, Finding, Subject

@@ -40,9 +40,9 @@ from projservo_cli.simulation.streams import (
     generator,
 )
 from projservo_cli.simulation.workspace import SceneObject, Truth, plant_of, turned
-from projservo_cli.stages.external_robot import simulated_robot
 from projservo_cli.stages.stage_inputs import CarryingObject, Contract
 from projservo_cli.stages.worlds.calibrated import CalibratedWorld, TruePoses
+from projservo_cli.stages.worlds.external_robot import simulated_robot
 from projservo_cli.stages.worlds.task_images import positioned, task_images
 from projservo_cli.task.body import make_body
 from projservo_cli.task.face import center_of

@@ -38,7 +38,7 @@ from projservo_cli.records import (
 from projservo_cli.simulation.analytic_plant import rig_distance
 from projservo_cli.simulation.faults import obstruction_of
 from projservo_cli.stages.carried_goals import markers_now
-from projservo_cli.stages.law_run import LawRun
+from projservo_cli.stages.runs.law_run import LawRun
 from projservo_cli.task.body import SETTLED, fit_body
 from projservo_cli.task.face import Task
 from projservo_cli.task.incidence_errors import IncidenceErrors, TaughtAndNow, incidence_errors

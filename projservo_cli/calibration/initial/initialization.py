@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from projservo_cli.calibration.bundle_adjustment import LeastSquares
 from projservo_cli.calibration.detections import Detections, cauchy_weights, deviation, per_block
-from projservo_cli.calibration.epipolar import ImageFrame, ImageGeometry, log_distances, marker_pairs
+from projservo_cli.calibration.initial.epipolar import ImageFrame, ImageGeometry, log_distances, marker_pairs
 from projservo_cli.calibration.prediction import Parameters
 from projservo_cli.geometry.displacements import aligned, cross_matrix
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators

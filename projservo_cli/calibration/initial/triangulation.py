@@ -11,7 +11,7 @@ from scipy.special import chdtri
 
 from projservo_cli.calibration.bundle_adjustment import LeastSquares
 from projservo_cli.calibration.detections import per_block
-from projservo_cli.calibration.epipolar import triangulated
+from projservo_cli.calibration.initial.epipolar import triangulated
 from projservo_cli.calibration.prediction import Parameters, projection_derivative
 from projservo_cli.geometry.displacements import homogeneous
 from projservo_cli.geometry.lens import undistort

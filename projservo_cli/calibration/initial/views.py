@@ -16,10 +16,10 @@ from projservo_cli.calibration.detections import (
     deviation,
     even_choice,
 )
-from projservo_cli.calibration.epipolar import Epipolar, ImageGeometry, similarity
+from projservo_cli.calibration.initial.epipolar import Epipolar, ImageGeometry, similarity
+from projservo_cli.calibration.initial.triangulation import Tracks
 from projservo_cli.calibration.lens_estimation import undistorted
 from projservo_cli.calibration.robust_fit import Solution, fit_from, fit_inliers
-from projservo_cli.calibration.triangulation import Tracks
 from projservo_cli.geometry.displacements import homogeneous
 from projservo_cli.records import FloatArray, WorkFailed
 

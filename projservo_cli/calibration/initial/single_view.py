@@ -27,7 +27,7 @@ from projservo_cli.calibration.detections import (
     deviation,
     even_choice,
 )
-from projservo_cli.calibration.epipolar import (
+from projservo_cli.calibration.initial.epipolar import (
     OUTLIER,
     Core,
     ImageFrame,
