@@ -458,7 +458,7 @@ def _in_words(one: Finding, calibration: Calibration) -> dict[str, Any]:
     }
 
 
-# Numbers of the object that carries the goal of a plan.
+# Name and numbers of an object that carries the goal of a plan.
 _OF_CARRIER = [field.name for field in fields(CarriedByObject) if "dims" not in field.metadata]
 
 
@@ -468,9 +468,9 @@ def _plan(run: Run) -> dict[str, Any]:
     angles = {f"{name}_deg": math.degrees(values.pop(name)) for name in ("theta_r", "theta_p", "theta_s")}
     objects = {}
     for carried in plan.carried:
-        of_object = {name.removeprefix("object_"): getattr(carried, name) for name in _OF_CARRIER}
+        of_object = {name.removeprefix("object_"): getattr(carried, name) for name in _OF_CARRIER[1:]}
         about = {"markers": carried.object_marker, "reason": carried.object_words}
-        objects[of_object.pop("name")] = of_object | about
+        objects[carried.object_name] = of_object | about
     values = {name: value for name, value in values.items() if name not in _OF_CARRIER}
     nearest = zip(NEAREST, plan.min_margin, plan.min_margin_mu, strict=True)
     return (
