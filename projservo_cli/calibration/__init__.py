@@ -1,7 +1,7 @@
 """Projective kinematics from stereo images of trial motions: [RH00] section 2.
 
-``estimate`` runs the steps: pixels (``detections``), geometry of the rig (``epipolar``), initial parameters
-(``initialization``), robust bundle adjustment (``fit``, ``adjustment``), frame and covariance
+``calibrate`` runs the steps: pixels (``detections``), geometry of the rig and initial parameters
+(``initial``), robust bundle adjustment (``robust_fit``, ``bundle_adjustment``), frame and covariance
 (``projective``), with the ``checks`` of the data before and of the fit after. ``prediction`` has the forward
 model, and predicts images and their errors from the result.
 """
