@@ -91,6 +91,16 @@ def test_incidences_on_an_object_are_met_where_it_is_now():
     assert trace.position_error_mm < 3.0 * planned.goal_deviation_mm
 
 
+def assert_met(trace, truth, hole, plane):
+    """The pin is in a hole (2, 3) and its tip on a plane (3, 3), m, in truth as well as is stated."""
+    assert (trace.verdict, trace.success, trace.free_dof) == ("converged", True, 1), trace.reason
+    ends = (truth.of((10, 11)) @ (trace.pose[-1] @ np.linalg.inv(truth.robot.base_tool)).T)[:, :3]
+    along, normal = hole[1] - hole[0], np.cross(plane[1] - plane[0], plane[2] - plane[0])
+    beside = np.linalg.norm(np.cross(ends - hole[0], along), axis=1).max() / np.linalg.norm(along)
+    above = abs((ends[1] - plane[0]) @ normal) / np.linalg.norm(normal)
+    assert (1e3 * np.array([beside, above]) < 2.0 * trace.incidence_mm).all()
+
+
 def test_a_part_and_the_scene_are_in_one_goal():
     """The pin in a hole of a part that has moved, its tip on a plane of the scene that has not."""
     table = {"side": {"on": "tool", "plane": [0, 1, 10]}, "table": {"on": "scene", "plane": "side"}}
@@ -108,14 +118,9 @@ def test_a_part_and_the_scene_are_in_one_goal():
     taught, T = truth.displacement(q_goal), config.objects.named["block"].moved
     pin, side = truth.of((10, 11)), truth.of((0, 1, 10))
     hole, plane = (pin @ (T @ taught).T)[:, :3], (side @ taught.T)[:, :3]
-    along, normal = hole[1] - hole[0], np.cross(plane[1] - plane[0], plane[2] - plane[0])
     for law in ("exact_track", "incidences"):
         trace = servo.run(config, calibration, planned, law)
-        assert (trace.verdict, trace.success, trace.free_dof) == ("converged", True, 1), trace.reason
-        ends = (pin @ (trace.pose[-1] @ np.linalg.inv(truth.robot.base_tool)).T)[:, :3]
-        beside = np.linalg.norm(np.cross(ends - hole[0], along), axis=1).max() / np.linalg.norm(along)
-        above = abs((ends[1] - plane[0]) @ normal) / np.linalg.norm(normal)
-        assert (1e3 * np.array([beside, above]) < 2.0 * trace.incidence_mm).all()
+        assert_met(trace, truth, hole, plane)
         assert trace.incidence_mm.max() < 1.5 * planned.goal_deviation_mm
     # What carries the hole does not carry the table.
     assert trace.incidence_deviation_mm[0] > planned.goal_deviation_mm > trace.incidence_deviation_mm[1]
@@ -160,14 +165,9 @@ def test_two_objects_are_in_one_goal():
     moved = {name: one.moved for name, one in config.objects.named.items()}
     pin, side = truth.of((10, 11)), truth.of((0, 1, 10))
     hole, plane = (pin @ (moved["block"] @ taught).T)[:, :3], (side @ (moved["box"] @ taught).T)[:, :3]
-    along, normal = hole[1] - hole[0], np.cross(plane[1] - plane[0], plane[2] - plane[0])
     for law in ("exact_track", "incidences"):
         trace = servo.run(config, calibration, planned, law)
-        assert (trace.verdict, trace.success, trace.free_dof) == ("converged", True, 1), trace.reason
-        ends = (pin @ (trace.pose[-1] @ np.linalg.inv(truth.robot.base_tool)).T)[:, :3]
-        beside = np.linalg.norm(np.cross(ends - hole[0], along), axis=1).max() / np.linalg.norm(along)
-        above = abs((ends[1] - plane[0]) @ normal) / np.linalg.norm(normal)
-        assert (1e3 * np.array([beside, above]) < 2.0 * trace.incidence_mm).all()
+        assert_met(trace, truth, hole, plane)
     for one, deviation in zip(planned.carried, trace.incidence_deviation_mm, strict=True):
         assert one.goal_deviation_mm < deviation < 2.0 * one.goal_deviation_mm
     shown = Driven(calibration, None, planned, {"incidences": trace})
