@@ -46,9 +46,9 @@ def test_a_world_as_calibrated_holds_no_truth(name):
         "motions",
         "carried_goals",
         "servo",
-        "law_run",
-        "run_trace",
-        "driven_robot",
+        "runs/law_run",
+        "runs/run_trace",
+        "runs/driven_robot",
         "worlds/calibrated",
     ],
 )
