@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 
@@ -89,6 +90,7 @@ def _carried(scenario: Scenario, carrier: CarryingObject, session: Session | Non
     return carried
 
 
+@lru_cache(maxsize=8)  # the same for all laws of a plan
 def markers_now(c: Calibration, carried: CarriedByObject) -> UncertainPoints:
     """Return the markers of an object of a plan where it is now."""
     numbers, taught = carried.object_marker.tolist(), carried.s_object_taught

@@ -15,7 +15,7 @@ from projservo_cli.geometry.displacements import generators
 from projservo_cli.metric.frame import changes_of
 from projservo_cli.monitoring.accuracy import metres_by
 from projservo_cli.records import MEET, MM, PARALLEL, PERPENDICULAR, Calibration, FloatArray, WorkFailed
-from projservo_cli.task.incidences import Flat, Incidence
+from projservo_cli.task.incidences import Incidence, points_of
 from projservo_cli.task.look_bundle import NO_POINTS, BundleFit, Look, LookRig, UncertainPoints
 
 # Angle between features, rad, by their relation.
@@ -122,11 +122,11 @@ class Placed(NamedTuple):
         Of markers M (..., k, 4) at T (..., 2, 4, 4), and X (..., o, 4) of the object; as found if not given.
         """
         M, T = self.M[0] if M is None else M, self.T if T is None else T
-        tool = _spanning(M, one.tool) @ np.swapaxes(T[..., 1, :, :], -1, -2)
+        tool = points_of(M, one.tool) @ np.swapaxes(T[..., 1, :, :], -1, -2)
         if not self.on_object(one):
-            return tool[..., :3], (_spanning(M, one.scene) @ np.swapaxes(T[..., 0, :, :], -1, -2))[..., :3]
+            return tool[..., :3], (points_of(M, one.scene) @ np.swapaxes(T[..., 0, :, :], -1, -2))[..., :3]
         own = tuple(tuple(number - M.shape[-2] for number in point) for point in one.scene)
-        return tool[..., :3], _spanning(self.of_object.X if X is None else X, own)[..., :3]
+        return tool[..., :3], points_of(self.of_object.X if X is None else X, own)[..., :3]
 
     def vectors(self, one: Incidence, unit_mm: FloatArray, **of: FloatArray) -> FloatArray:
         """Vectors (..., c) of an incidence, mm, then rad, of markers as of ``features``."""
@@ -161,11 +161,6 @@ class Placed(NamedTuple):
         steps[:, :, :3] = _STEP * np.eye(3 * len(X)).reshape(-1, len(X), 3)
         up, down = np.split(self.vectors(one, self.unit_mm[:1], X=np.concatenate([X + steps, X - steps])), 2)
         return np.asarray((up - down).T / (2.0 * _STEP))
-
-
-def _spanning(M: FloatArray, flat: Flat) -> FloatArray:
-    """Points (..., l, 4) that span a feature of markers (..., k, 4)."""
-    return np.stack([M[..., list(numbers), :].mean(axis=-2) for numbers in flat], axis=-2)
 
 
 @lru_cache(maxsize=8)

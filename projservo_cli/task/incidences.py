@@ -215,8 +215,8 @@ def free_motions(incidences: Incidences, H: FloatArray, H_hat: FloatArray) -> Fl
 
 
 def points_of(M: FloatArray, flat: Flat) -> FloatArray:
-    """Points (k, 4), a_inf·A = 1, that span a feature of markers (m, 4) of the body."""
-    return np.array([M[list(numbers)].mean(axis=0) for numbers in flat])
+    """Points (..., k, 4), a_inf·A = 1, that span a feature of markers (..., m, 4) of the body."""
+    return np.stack([M[..., list(numbers), :].mean(axis=-2) for numbers in flat], axis=-2)
 
 
 def images_of(model: Model, features: Sequence[FloatArray], H: FloatArray) -> FloatArray:
@@ -333,12 +333,12 @@ def incidences_of(
     rows, senses = list[FloatArray](), [NO_INCIDENCES.senses]
     for k, (one, scene) in enumerate(zip(asked, scenes, strict=True)):
         tool = points_of(body.M, one.tool)
+        if not np.isfinite(scene).all():
+            raise WorkFailed(
+                f"incidence {one.name}: fewer than two cameras see all markers of its feature of the scene: "
+                "name others, or let two see these"
+            )
         for points in (tool, scene):
-            if not np.isfinite(points).all():
-                raise WorkFailed(
-                    f"incidence {one.name}: fewer than two cameras see all markers of its feature of the "
-                    "scene: name others, or let two see these"
-                )
             if np.linalg.matrix_rank(points / np.linalg.norm(points, axis=1)[:, None], 1e-6) < len(points):
                 raise WorkFailed(
                     f"incidence {one.name}: its points span no {KINDS[len(points) - 1]}: name others"
