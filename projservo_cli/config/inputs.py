@@ -248,7 +248,14 @@ def _displacement(config: Config) -> StandOff | None:
     along = None if config.task is None else config.task.goal.displaced
     if config.task is None or along is None:
         return None
-    on = {config.features[pair[1]].on for pair in config.task.goal.incidences}
+    scenes = {pair[1]: config.features[pair[1]] for pair in config.task.goal.incidences}
+    for name, one in scenes.items():
+        if not isinstance(one.source, str):
+            raise InputError(
+                f"task.goal.displaced: {name} is of markers of {one.on}, which are not displaced: teach the "
+                "approach as a goal of its own"
+            )
+    on = {one.on for one in scenes.values()}
     if len(on) > 1:
         raise InputError(
             f"task.goal.displaced: the incidences of the goal are on {' and '.join(sorted(on))}, so teach "

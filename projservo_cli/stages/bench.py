@@ -47,7 +47,7 @@ class Case:
 
     def __init__(self, inputs: ServoInputs) -> None:
         assert inputs.plan.truth is not None
-        given = replace(inputs, plan=replace(inputs.plan, features="body"))
+        given = replace(inputs, plan=replace(inputs.plan.of_taught_pose, features="body"))
         scenario = run_scenario(given, inputs.plan.truth.calibration)
         shown, gains = scenario.exact, scenario.gains
         self.m, self.q_start, self.model, self.gains = (

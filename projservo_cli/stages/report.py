@@ -144,7 +144,7 @@ def comparison_of(inputs: ServoInputs, calibration: Calibration, plan: Plan) -> 
     inputs : of laws by themselves on the ideal plant, which measure the face point by point, but with the
         body where there are not two views: nothing keeps them out of regions. The goal is the taught pose.
     """
-    inputs = replace(inputs, plan=replace(inputs.plan, incidences=(), carriers=()))
+    inputs = replace(inputs, plan=inputs.plan.of_taught_pose)
     if not is_stereo(calibration.view):
         inputs = replace(inputs, plan=replace(inputs.plan, features="body"))
     scenario = run_scenario(inputs, calibration)

@@ -1,7 +1,7 @@
 """Inputs of each stage: records of the values that it reads, of which its key is a hash."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -294,6 +294,11 @@ class PlanInputs:
         if self.task is None:
             raise InputError("this stage needs a task: set task.start and task.goal")
         return self.task
+
+    @property
+    def of_taught_pose(self) -> "PlanInputs":
+        """Return the inputs of the whole pose that was taught, wherever objects are now."""
+        return replace(self, incidences=(), carriers=())
 
     def cameras_at(self, q: FloatArray) -> FloatArray | None:
         """Cameras (V, 3, 4) from the base frame at joints (n,), rad or m, px; None if not described."""

@@ -165,12 +165,17 @@ class TaskImages(NamedTuple):
         return np.array([found[one.carrier] for one in goal.incidences])
 
     def scenes(self, H_taught: FloatArray) -> list[FloatArray]:
-        """Points (…, 4) that span the feature of the scene of each incidence, by displacements (g, 4, 4)."""
-        goal = self.goal
-        return [
-            points_of(np.concatenate([self.body.M, goal.place(one.carrier).M]), one.scene) @ H.T
-            for one, H in zip(goal.incidences, H_taught, strict=True)
-        ]
+        """Points (…, 4) that span the feature of the scene of each incidence, by displacements (g, 4, 4).
+
+        Raises WorkFailed for one of the markers of an object that has not been looked at.
+        """
+        found = list[FloatArray]()
+        for one, H in zip(self.goal.incidences, H_taught, strict=True):
+            M = np.concatenate([self.body.M, self.goal.place(one.carrier).M])
+            if not one.shown_by(range(len(M))):
+                raise WorkFailed(f"incidence {one.name}: nobody has looked where its object is: plan first")
+            found.append(points_of(M, one.scene) @ H.T)
+        return found
 
     def displacement_at_start(self, model: Model) -> FloatArray:
         """Displacement (4, 4) of the body at the start; raises WorkFailed where images do not show it."""

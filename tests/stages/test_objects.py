@@ -7,8 +7,11 @@ from functools import cache
 import numpy as np
 import pytest
 
+from projservo_cli.config.inputs import servo_inputs
 from projservo_cli.records import InputError, WorkFailed
 from projservo_cli.report.report_data import REGISTER, Driven
+from projservo_cli.stages.bench import Case
+from projservo_cli.stages.scenario import run_scenario
 from tests.configured import calibrate, plan, servo, truth_of
 from tests.known import configured
 from tests.studies.carried_goals import carried_pose
@@ -195,6 +198,19 @@ def test_markers_of_an_object_are_features():
     off_deg = np.degrees(np.arccos(pin @ edge / np.linalg.norm(pin) / np.linalg.norm(edge)))
     assert off_mm < 2.0 * trace.incidence_mm[0] < planned.goal_deviation_mm
     assert off_deg < 2.0 * trace.incidence_deg[1] < 4.0
+
+
+def test_features_of_markers_of_an_object_need_a_look_at_it_and_are_not_displaced():
+    features = {"spot": {"on": "block", "point": [40, 41]}}
+    config = insertion({"block": BLOCK}, features, "[[tip, spot]]")
+    calibration = calibrate.run(config)[1]
+    scenario = run_scenario(servo_inputs(config), calibration)
+    with pytest.raises(WorkFailed, match="tip on spot: nobody has looked where its object is: plan first"):
+        scenario.ends.task(scenario.world.model)
+    away = config.replace({"task.goal.displaced": {"along": "pin", "by_m": 0.02}})
+    with pytest.raises(InputError, match="spot is of markers of block, which are not displaced: teach the"):
+        servo_inputs(away)
+    assert Case(servo_inputs(config)).m == len(config.face_numbers)  # of the pose that was taught
 
 
 def test_features_of_markers_that_an_object_does_not_have_are_refused():
