@@ -268,9 +268,14 @@ def _write_tables(run: Any, folder: Path) -> Iterator[Path]:
     from projservo_cli.records import flat_fields
     from projservo_cli.store.files import write_whole
     from projservo_cli.store.observation_tables import to_csv
+    from projservo_cli.store.run_file import further_parts
 
     rows, tables = [], {}
-    records = {(n, label): r for n, result in run.results.items() for label, r in result.records.items()}
+    records: dict[tuple[str, ...], Any] = {
+        (name, label): record for name, one in run.results.items() for label, record in one.records.items()
+    }
+    for place, record in [*records.items()]:
+        records |= {(*place, name): part for name, part in further_parts(record)}
     for place, record in records.items():
         # A name that a file can have anywhere.
         file = re.sub(r"\W", "_", "_".join(filter(None, place)), flags=re.ASCII) + ".csv"

@@ -18,7 +18,7 @@ import os
 import re
 import shutil
 import typing
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
@@ -378,18 +378,19 @@ def save_record(group: "h5netcdf.Group", record: Any) -> None:
         data.attrs.update({"units": field.metadata["units"], "long_name": field.metadata["about"]})
         if boolean:  # netCDF has no booleans; xarray marks them so
             data.attrs["dtype"] = "bool"
-    for entry in filter(is_list, dataclasses.fields(record)):
-        for place, part in _further(entry.name, getattr(record, entry.name)):
-            save_record(group.create_group(place), part)
+    for place, part in further_parts(record):
+        save_record(group.create_group(place), part)
     if isinstance(record, Trace):  # a coordinate, which reading makes of the period again
         seconds = record.period * np.arange(sizes["time"])
         time = group.create_variable("time", ("time",), data=seconds, **_checked(seconds))
         time.attrs.update({"units": "s", "long_name": "time since the first instant"})
 
 
-def _further(name: str, parts: Sequence[Any]) -> Iterator[tuple[str, Any]]:
-    """Parts of a list after the first, with the names of their groups."""
-    return ((f"{name}_{k}", part) for k, part in enumerate(parts[1:], 2))
+def further_parts(record: Any) -> Iterator[tuple[str, Any]]:
+    """Parts of the lists of a record after the first, with the names of their groups."""
+    for entry in filter(is_list, dataclasses.fields(record)):
+        for k, part in enumerate(getattr(record, entry.name)[1:], 2):
+            yield f"{entry.name}_{k}", part
 
 
 def dataset_of(record: Any) -> Any:

@@ -8,9 +8,22 @@ import numpy as np
 
 from projservo_cli.config import load_config
 from projservo_cli.config.schema import json_schema
-from projservo_cli.records import flat_fields
-from projservo_cli.store.run_file import load
+from projservo_cli.records import CarriedByObject, Plan, changed, flat_fields
+from projservo_cli.store.run_file import Result, Run, load, save
+from tests.fake_records import fake
 from tests.report.conftest import read, words
+
+
+def test_an_export_has_a_table_of_each_object_of_a_goal(projservo, tmp_path):
+    objects = tuple(fake(CarriedByObject, object_name=name) for name in ("block", "box"))
+    plan = changed(fake(Plan), carried=objects)
+    save(Run(tmp_path / "out" / "run.h5", "", {"plan": Result("", "", {}, {}, {"": plan})}))
+    answer = projservo("export", str(tmp_path / "out"), "--json")
+    assert answer.code == 0, answer.err
+    assert {Path(file).name for file in answer.json["files"]} >= {"plan.csv", "plan_carried_2.csv"}
+    with (tmp_path / "out" / "csv" / "fields.csv").open(newline="") as file:
+        named = [row["value"] for row in csv.DictReader(file) if row["field"] == "object_name"]
+    assert named == ["block", "box"]
 
 
 def test_an_export_holds_every_array_and_says_what_it_is(projservo, reported, tmp_path):
