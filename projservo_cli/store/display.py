@@ -48,6 +48,8 @@ class Displayable(Printed):
     def to_xarray(self) -> Any:
         """Return all arrays and scalars as a Dataset, as in the run file, with coordinates.
 
+        Of a list of parts, such as the objects of a goal, it holds the first.
+
         Raises
         ------
         InputError
