@@ -39,20 +39,20 @@ def _limits(console: Console, *, config: str, shift: tuple[int, ...]) -> None:
     stay. Nothing is ever moved beyond them.
     """
     from projservo_cli.config.editing import with_limits
-    from projservo_cli.hardware import joint_limits
+    from projservo_cli.hardware import taught_limits
     from projservo_cli.store.files import text_of, write_whole
 
     path = Path(config).resolve()  # the file itself where the name is a link
     text = text_of(Path(config), "a configuration", _MAX_BYTES)
     with_limits(text, [], config)  # before somebody moves the arm for it
     with _servos(console, config, text) as servos:
-        joint_limits.require_known(shift, len(servos.ids))
+        taught_limits.require_known(shift, len(servos.ids))
         console.wait("take hold of the arm: it will be released")
         servos.release()
-        moved = joint_limits.watch(
+        moved = taught_limits.watch(
             servos, _entered(console, "move joint after joint through all that is allowed, ten seconds each")
         )
-        limits = joint_limits.limits_deg(servos, moved, shift)
+        limits = taught_limits.limits_deg(servos, moved, shift)
     written = with_limits(text, limits, config)
     _require_limits(written, limits, config)
     write_whole(path, written)

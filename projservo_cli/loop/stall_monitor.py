@@ -21,7 +21,7 @@ from projservo_cli.loop.verdicts import (
     tolerance,
 )
 from projservo_cli.records import BoolArray, FloatArray
-from projservo_cli.robots.client import DrivenRobot
+from projservo_cli.robots.latency_compensation import DrivenRobot
 
 # Share of the tolerance that a robot which stands may still move.
 _SETTLED = 0.5

@@ -6,7 +6,7 @@ import numpy as np
 
 from projservo_cli.records import BoolArray, FloatArray
 from projservo_cli.robots.contract import Bounds, PluginRobot, Reading
-from projservo_cli.robots.latency import History
+from projservo_cli.robots.latency_estimation import History
 
 # Share of the sag allowed for that a servo may still be behind where sag is separated from lag.
 _STILL = 0.2

@@ -30,7 +30,7 @@ from projservo_cli.records import (
 )
 from projservo_cli.report.live_page import annotated, recording_page
 from projservo_cli.robots.contract import PluginRobot, Reading, at_rest_after
-from projservo_cli.robots.joints import Joints
+from projservo_cli.robots.joint_limits import Joints
 from projservo_cli.robots.pacing import Steered
 from projservo_cli.robots.standstill import averaged
 from projservo_cli.simulation.faults import robot_by_itself

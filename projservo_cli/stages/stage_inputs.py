@@ -11,7 +11,7 @@ from projservo_cli.image_size import ImageSize
 from projservo_cli.records import TOOL, Calibration, FloatArray, InputError, JointLimits
 from projservo_cli.result_hashes import File, digest, encoded
 from projservo_cli.robots.contract import Bounds
-from projservo_cli.robots.joints import Joints
+from projservo_cli.robots.joint_limits import Joints
 from projservo_cli.settings.cameras import Cameras
 from projservo_cli.settings.control import (
     LawSettings,

@@ -25,7 +25,7 @@ from projservo_cli.records import (
     WorkFailed,
 )
 from projservo_cli.robots.contract import Bounds, PluginRobot, Reading, at_rest_after
-from projservo_cli.robots.joints import Joints
+from projservo_cli.robots.joint_limits import Joints
 from projservo_cli.robots.standstill import frames_of, seen_at_rest
 from projservo_cli.settings.sections import JointVector
 from projservo_cli.settings.task import Goal, GoalImages, TaskSettings, sigma_key

@@ -71,7 +71,7 @@ TERMS = {
     "JIT": "geometry/jit",
     "joint limit": "planning/constraints",
     "JSON Schema": "config/schema",
-    "latency": "robots/latency",
+    "latency": "robots/latency_estimation",
     "lens distortion": "geometry/lens",
     "locks?": "store/files",
     "metrics": "loop/run_metrics",

@@ -18,7 +18,7 @@ from projservo_cli.loop.verdicts import (
 )
 from projservo_cli.records import JointLimits
 from projservo_cli.robots.contract import Bounds
-from projservo_cli.robots.latency import DelayPrior
+from projservo_cli.robots.latency_estimation import DelayPrior
 from tests.scene import limits
 
 PERIOD, TICK = 0.1, 1.5e-3

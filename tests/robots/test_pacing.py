@@ -7,7 +7,7 @@ import pytest
 
 from projservo_cli.records import VIEWS, JointLimits, WorkFailed
 from projservo_cli.robots.contract import Bounds, PluginRobot, at_rest_after
-from projservo_cli.robots.latency import DelayPrior, Delays, History
+from projservo_cli.robots.latency_estimation import DelayPrior, Delays, History
 from projservo_cli.robots.pacing import SetPoint, Steered
 
 PERIOD = 0.04

@@ -11,9 +11,9 @@ from projservo_cli import Observations, calibrate, plan, record, servo
 from projservo_cli.config import load_config
 from projservo_cli.config.inputs import calibration_inputs, teach_inputs
 from projservo_cli.records import VIEWS, InputError, JointLimits, WorkFailed
-from projservo_cli.robots.client import DrivenRobot
 from projservo_cli.robots.contract import Bounds, PluginRobot, Reading, at_rest_after
-from projservo_cli.robots.latency import DelayPrior, Delays
+from projservo_cli.robots.latency_compensation import DrivenRobot
+from projservo_cli.robots.latency_estimation import DelayPrior, Delays
 from projservo_cli.robots.standstill import Standstill, averaged
 from projservo_cli.settings.cameras import Cameras
 from projservo_cli.settings.task import GoalImages

@@ -37,12 +37,12 @@ from projservo_cli.records import (
     Plan,
 )
 from projservo_cli.results import ImageModel
-from projservo_cli.robots.client import DrivenRobot
+from projservo_cli.robots.latency_compensation import DrivenRobot
 from projservo_cli.robots.session import Session
 from projservo_cli.simulation.analytic_plant import AnalyticPlant, Ends, Plant
 from projservo_cli.stages.motions import PathReplanner, search_of, why_closed
-from projservo_cli.stages.runs.driven_robot import connected_robot
 from projservo_cli.stages.runs.plugin_law import LawSetup, PluginLaw
+from projservo_cli.stages.runs.robot_with_monitors import connected_robot
 from projservo_cli.stages.scenario import RunScenario
 from projservo_cli.task.face import Task, center_of
 from projservo_cli.task.incidences import whole_pose

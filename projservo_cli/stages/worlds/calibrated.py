@@ -24,9 +24,9 @@ from projservo_cli.records import (
     Model,
     WorkFailed,
 )
-from projservo_cli.robots.client import DrivenRobot
 from projservo_cli.robots.contract import Reading, Robot
-from projservo_cli.robots.joints import Joints
+from projservo_cli.robots.joint_limits import Joints
+from projservo_cli.robots.latency_compensation import DrivenRobot
 from projservo_cli.robots.pacing import Steered
 from projservo_cli.robots.session import Session
 from projservo_cli.robots.standstill import STILL, seen_at_rest

@@ -12,7 +12,7 @@ from projservo_cli.hardware.camera_robot import Arm, CameraRobot
 from projservo_cli.passwords import MASK
 from projservo_cli.records import FloatArray, InputError, WorkFailed
 from projservo_cli.robots.contract import Bounds, PluginRobot, Reading, Robot
-from projservo_cli.robots.joints import Joints
+from projservo_cli.robots.joint_limits import Joints
 from projservo_cli.robots.pacing import Steered
 from projservo_cli.robots.session import Session
 from projservo_cli.robots.standstill import STILL, Standstill, at_rest

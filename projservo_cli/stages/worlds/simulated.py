@@ -19,9 +19,9 @@ from projservo_cli.records import (
     Model,
     WorkFailed,
 )
-from projservo_cli.robots.client import DrivenRobot, weights
 from projservo_cli.robots.contract import PluginRobot, Robot
-from projservo_cli.robots.joints import limit_passed
+from projservo_cli.robots.joint_limits import limit_passed
+from projservo_cli.robots.latency_compensation import DrivenRobot, weights
 from projservo_cli.robots.pacing import Steered
 from projservo_cli.robots.session import Session
 from projservo_cli.settings.task import TaskSettings

@@ -21,7 +21,7 @@ from projservo_cli.monitoring.innovation_tests import WINDOW
 from projservo_cli.records import BoolArray, FloatArray, IntArray, WorkFailed
 from projservo_cli.robots.contract import Reading
 from projservo_cli.robots.frame_recorder import FrameRecorder
-from projservo_cli.robots.latency import DelayPrior, Delays, squares_by_joints
+from projservo_cli.robots.latency_estimation import DelayPrior, Delays, squares_by_joints
 from projservo_cli.robots.object_watch import ObjectWatch
 from projservo_cli.robots.pacing import Steered
 from projservo_cli.simulation.analytic_plant import Plant, observe

@@ -9,9 +9,9 @@ from projservo_cli.calibration.prediction import predict
 from projservo_cli.monitoring.image_monitor import ImageMonitor
 from projservo_cli.monitoring.innovation_tests import WINDOW
 from projservo_cli.records import Calibration, InputError, Plan
-from projservo_cli.robots.client import DrivenRobot, Known
 from projservo_cli.robots.contract import Robot
-from projservo_cli.robots.latency import DelayPrior
+from projservo_cli.robots.latency_compensation import DrivenRobot, Known
+from projservo_cli.robots.latency_estimation import DelayPrior
 from projservo_cli.robots.object_watch import ObjectWatch
 from projservo_cli.robots.session import Session
 from projservo_cli.settings.disturbance import EachView
