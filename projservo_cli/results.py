@@ -20,7 +20,7 @@ from projservo_cli.calibration.prediction import (
 from projservo_cli.calibration.refit import refit, since_moved
 from projservo_cli.geometry.kinematics import project as pixels_of
 from projservo_cli.metric.frame import Metric, Scale, links
-from projservo_cli.metric.kinematic_errors import KinematicErrors, in_model_frames, kinematic_errors
+from projservo_cli.metric.nominal_comparison import KinematicErrors, in_model_frames, kinematic_errors
 from projservo_cli.observations import Observations, require_observations
 from projservo_cli.planning.pose_selection import Suggestion, region_around, suggest
 from projservo_cli.records import (

@@ -6,7 +6,7 @@
 model, and predicts images and their errors from the result.
 """
 
-from projservo_cli.calibration.checks.quality import WEAK_NOISE
+from projservo_cli.calibration.checks.observability_and_verdict import WEAK_NOISE
 from projservo_cli.calibration.checks.validation import cross_validate, residual_statistics
 from projservo_cli.calibration.initial.initialization import Nominal
 from projservo_cli.calibration.pipeline import calibrate

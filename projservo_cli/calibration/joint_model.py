@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from projservo_cli.calibration.bundle_adjustment import LeastSquares
-from projservo_cli.calibration.checks.model_error import suspected
+from projservo_cli.calibration.checks.model_errors import suspected
 from projservo_cli.calibration.detections import MAX_JUDGED, per_rad
 from projservo_cli.calibration.initial.epipolar import ImageGeometry
 from projservo_cli.calibration.robust_fit import Solution, fit_from, left_out_errors, left_out_px

@@ -11,18 +11,20 @@ from scipy.special import chdtri
 from threadpoolctl import threadpool_limits
 
 from projservo_cli.calibration.bundle_adjustment import LeastSquares
+from projservo_cli.calibration.checks.image_contradictions import checked_geometry
 from projservo_cli.calibration.checks.joint_order import require_poses
-from projservo_cli.calibration.checks.model_error import ModelCheck
-from projservo_cli.calibration.checks.numbering import checked_geometry
-from projservo_cli.calibration.checks.other_poses import on_shown_poses
+from projservo_cli.calibration.checks.markers_not_on_tool import standing, standing_markers, without_strange
+from projservo_cli.calibration.checks.mislabelled_data import relabelled
+from projservo_cli.calibration.checks.mismatched_poses import on_shown_poses
+from projservo_cli.calibration.checks.model_errors import ModelCheck
+from projservo_cli.calibration.checks.observability_and_verdict import WEAK_NOISE, assess
 from projservo_cli.calibration.checks.outliers import (
     Outliers,
     moved_images,
     outlier_rows,
     rejection_reasons,
 )
-from projservo_cli.calibration.checks.quality import WEAK_NOISE, assess
-from projservo_cli.calibration.checks.refusal import (
+from projservo_cli.calibration.checks.unusable_fit import (
     DOUBTED_RATIO,
     MUCH,
     contradiction,
@@ -32,8 +34,6 @@ from projservo_cli.calibration.checks.refusal import (
     straight_joints,
     unexplained,
 )
-from projservo_cli.calibration.checks.relabelling import relabelled
-from projservo_cli.calibration.checks.strange_markers import standing, standing_markers, without_strange
 from projservo_cli.calibration.detections import (
     Detections,
     require_images,

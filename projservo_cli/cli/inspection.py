@@ -198,7 +198,7 @@ def _in_metres(
     from projservo_cli.config import load_config
     from projservo_cli.config.inputs import joints_of
     from projservo_cli.metric.frame import MetricParameters
-    from projservo_cli.metric.kinematic_errors import contradictions, errors_found
+    from projservo_cli.metric.nominal_comparison import contradictions, errors_found
     from projservo_cli.metric.opencv import opencv_cameras
     from projservo_cli.records import TOOL
     from projservo_cli.results import ImageModel

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from projservo_cli.calibration.checks.quality import WEAK_NOISE
+from projservo_cli.calibration.checks.observability_and_verdict import WEAK_NOISE
 from projservo_cli.calibration.robust_fit import chi2_band
 from projservo_cli.findings import REACH_M, REACH_RAD
 from projservo_cli.laws import must_converge, run_name

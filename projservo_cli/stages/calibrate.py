@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from projservo_cli.calibration.checks.board_numbering import BoardNumbering
+from projservo_cli.calibration.checks.board_corner_numbering import BoardNumbering
 from projservo_cli.calibration.checks.joint_order import undecided_pairs
 from projservo_cli.calibration.checks.screening import screened
 from projservo_cli.calibration.checks.validation import cross_validate

@@ -77,7 +77,7 @@ TERMS = {
     "metrics": "loop/run_metrics",
     "MuJoCo": "simulation/__init__",
     "null space": "geometry/kernels",
-    "observability": "calibration/checks/quality",
+    "observability": "calibration/checks/observability_and_verdict",
     "obstacle": "planning/keep_out",
     "outlier": "calibration/checks/outliers",
     "pose selection": "planning/pose_selection",

@@ -12,7 +12,7 @@ from scipy.stats import chi2
 
 from projservo_cli.cli import run
 from projservo_cli.metric.frame import MetricParameters
-from projservo_cli.metric.kinematic_errors import in_model_frames
+from projservo_cli.metric.nominal_comparison import in_model_frames
 from projservo_cli.metric.opencv import opencv_cameras
 from projservo_cli.records import InputError, changed
 from projservo_cli.results import ImageModel

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import projservo_cli as projservo
-from projservo_cli.metric.kinematic_errors import in_model_frames
+from projservo_cli.metric.nominal_comparison import in_model_frames
 from projservo_cli.observations import Observations
 from projservo_cli.records import Observation, WorkFailed
 from projservo_cli.store.observation_tables import write_table

@@ -1,7 +1,7 @@
 """Checks of the data, of a fit and of its predictions.
 
-``screening`` and ``numbering`` come before a fit. ``outliers`` explains rejected images, ``refusal`` tells
-whether the fit describes the data, ``model_error`` tests for deviations of arm and rig from the model, and
-``undecided`` for what the poses leave open. ``quality`` gives the verdict; ``validation`` compares with poses
-that no fit has seen.
+``screening``, ``image_contradictions`` and ``board_corner_numbering`` come before a fit. ``outliers``
+explains rejected images, ``unusable_fit`` tells whether the fit describes the data, ``model_errors`` tests
+for deviations of arm and rig from the model, and ``joint_order`` for what the poses leave open.
+``observability_and_verdict`` gives the verdict; ``validation`` compares with poses that no fit has seen.
 """

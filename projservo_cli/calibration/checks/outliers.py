@@ -11,8 +11,8 @@ from scipy.optimize import least_squares
 from scipy.spatial import cKDTree
 
 from projservo_cli.calibration.bundle_adjustment import LeastSquares, fit_offsets
-from projservo_cli.calibration.checks.model_error import image_motions
-from projservo_cli.calibration.checks.other_poses import EXPLAINED, MOSTLY, SEEN_OF_IMAGE, shown_poses
+from projservo_cli.calibration.checks.mismatched_poses import EXPLAINED, MOSTLY, SEEN_OF_IMAGE, shown_poses
+from projservo_cli.calibration.checks.model_errors import image_motions
 from projservo_cli.calibration.detections import RAYLEIGH, Detections
 from projservo_cli.calibration.initial.epipolar import OUTLIER
 from projservo_cli.calibration.initial.initialization import stationary

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 
-from projservo_cli.calibration.checks.board_numbering import BoardNumbering
-from projservo_cli.calibration.checks.quality import UNDETERMINED_NOISE
+from projservo_cli.calibration.checks.board_corner_numbering import BoardNumbering
+from projservo_cli.calibration.checks.observability_and_verdict import UNDETERMINED_NOISE
 from projservo_cli.calibration.checks.screening import without_placeholders
 from projservo_cli.calibration.detections import SAME_READING, Detections, per_rad, require_motion
 from projservo_cli.calibration.initial.epipolar import Epipolar

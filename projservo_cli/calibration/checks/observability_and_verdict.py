@@ -8,7 +8,7 @@ import numpy as np
 from scipy.special import bdtrc
 
 from projservo_cli.calibration.bundle_adjustment import LeastSquares
-from projservo_cli.calibration.checks.model_error import ModelCheck, examine
+from projservo_cli.calibration.checks.model_errors import ModelCheck, examine
 from projservo_cli.calibration.detections import (
     MAX_JUDGED,
     MAX_REACHES,

@@ -7,7 +7,7 @@ import pytest
 
 from projservo_cli import words
 from projservo_cli.calibration import calibrate, predict
-from projservo_cli.calibration.checks import model_error
+from projservo_cli.calibration.checks import model_errors
 from projservo_cli.deviations import CHANGES, DEVIATIONS
 from projservo_cli.findings import REFUSES
 from projservo_cli.records import Observation, WorkFailed
@@ -95,9 +95,9 @@ def test_every_row_of_the_table_is_tested_on_some_fit():
     robot, fitted = random_robot(TYPES, np.random.default_rng(1)), []
     calibrate(table(robot, gear, 2, 0.0, 7), TYPES, fitted=lambda solution, _: fitted.append(solution))
     solution = fitted[0]
-    extent = model_error._Extent.of(solution)
+    extent = model_errors._Extent.of(solution)
     wide = extent._replace(half=np.full_like(extent.half, np.pi), cycles=np.full_like(extent.half, 3.0))
-    kinds = {one.kind for one in model_error._nuisances(solution.problem, solution.params, wide)}
+    kinds = {one.kind for one in model_errors._nuisances(solution.problem, solution.params, wide)}
     assert kinds == {*DEVIATIONS}
     assert all(other in DEVIATIONS for row in DEVIATIONS.values() if (other := row.cause))
     assert all(row.code in words.ROWS and {*row.contains} <= {*CHANGES} for row in CHANGES.values())

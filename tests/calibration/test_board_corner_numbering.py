@@ -7,7 +7,7 @@ import pytest
 
 import projservo_cli as projservo
 from projservo_cli.calibration import calibrate, predict
-from projservo_cli.calibration.checks.board_numbering import BoardNumbering
+from projservo_cli.calibration.checks.board_corner_numbering import BoardNumbering
 from projservo_cli.calibration.checks.validation import residual_statistics
 from projservo_cli.observations import Observations
 from projservo_cli.store.observation_tables import read_table

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from projservo_cli.calibration.bundle_adjustment import LeastSquares
-from projservo_cli.calibration.checks.model_error import stepped
-from projservo_cli.calibration.checks.other_poses import erring_joint, other_order
+from projservo_cli.calibration.checks.mismatched_poses import erring_joint, other_order
+from projservo_cli.calibration.checks.model_errors import stepped
+from projservo_cli.calibration.checks.observability_and_verdict import check_model
 from projservo_cli.calibration.checks.outliers import MAX_OF_POSE, Outliers, fits_other_joints
-from projservo_cli.calibration.checks.quality import check_model
 from projservo_cli.calibration.checks.validation import cross_validate
 from projservo_cli.calibration.detections import beginning_in
 from projservo_cli.calibration.initial.epipolar import ImageGeometry

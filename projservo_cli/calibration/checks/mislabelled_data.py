@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from projservo_cli.calibration.bundle_adjustment import LeastSquares, minimize
-from projservo_cli.calibration.checks.numbering import size_changes
+from projservo_cli.calibration.checks.image_contradictions import size_changes
 from projservo_cli.calibration.checks.outliers import Outliers
-from projservo_cli.calibration.checks.refusal import unexplained
+from projservo_cli.calibration.checks.unusable_fit import unexplained
 from projservo_cli.calibration.detections import Detections, even_choice
 from projservo_cli.calibration.initial.initialization import Search, bodies, starting_markers, starts
 from projservo_cli.calibration.robust_fit import Solution, fit_from
