@@ -41,9 +41,11 @@ from projservo_cli.calibration.detections import (
     require_no_copies,
     require_size_and_noise,
 )
+from projservo_cli.calibration.initial.camera_pair import with_best_pair
+from projservo_cli.calibration.initial.camera_resection import with_all_views
+from projservo_cli.calibration.initial.camera_weights import with_own_noise
 from projservo_cli.calibration.initial.epipolar import ImageFrame, ImageGeometry
 from projservo_cli.calibration.initial.initialization import Nominal, Progress, Search
-from projservo_cli.calibration.initial.views import with_all_views, with_best_pair, with_own_noise
 from projservo_cli.calibration.joint_model import AUTO, Hypothesis, fit_joint_model, hypotheses_of
 from projservo_cli.calibration.lens_estimation import fit_lens, share_explained, undistorted
 from projservo_cli.calibration.prediction import LENS, along_the_arm

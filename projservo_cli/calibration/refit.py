@@ -29,8 +29,8 @@ from projservo_cli.calibration.detections import (
     per_block,
     per_rad,
 )
+from projservo_cli.calibration.initial.camera_resection import resected
 from projservo_cli.calibration.initial.epipolar import OUTLIER
-from projservo_cli.calibration.initial.views import resected
 from projservo_cli.calibration.prediction import (
     CAMERA,
     Parameters,

@@ -1,25 +1,22 @@
-"""Any number of views: the pair with which a fit begins, further cameras by resection, a noise of each.
+"""Resection of cameras: each camera beyond the first pair, from points that a fit has found.
 
 [HZ04] is R. Hartley, A. Zisserman, "Multiple View Geometry in Computer Vision", 2nd ed., 2004.
 """
 
 import dataclasses
-from itertools import combinations
 
 import numpy as np
 
 from projservo_cli.calibration.bundle_adjustment import LeastSquares
 from projservo_cli.calibration.detections import (
-    RAYLEIGH,
     Detections,
     cauchy_weights,
     deviation,
     even_choice,
 )
-from projservo_cli.calibration.initial.epipolar import Epipolar, ImageGeometry, similarity
+from projservo_cli.calibration.initial.epipolar import ImageGeometry, similarity
 from projservo_cli.calibration.initial.triangulation import Tracks
-from projservo_cli.calibration.lens_estimation import undistorted
-from projservo_cli.calibration.robust_fit import Solution, fit_from, fit_inliers
+from projservo_cli.calibration.robust_fit import Solution, fit_from
 from projservo_cli.geometry.displacements import homogeneous
 from projservo_cli.records import FloatArray, WorkFailed
 
@@ -27,39 +24,10 @@ from projservo_cli.records import FloatArray, WorkFailed
 _MINIMAL, _SAMPLES = 6, 300
 # Maximum number of points by which samples are compared.
 _JUDGES = 2000
-# Rounds of reweighting in a resection, and of the noise of each view.
-_ROUNDS, _NOISE_ROUNDS = 10, 6
-# Relative change of the noise of each view that ends these rounds.
-_SETTLED = 0.01
+# Rounds of reweighting in a resection.
+_ROUNDS = 10
 # Minimum number of detections of a view for a camera: 11 numbers, and as many to judge them.
 _LEAST = 12
-
-
-def with_best_pair(detections: Detections) -> Detections:
-    """Choose the pair of views that determines most; two views are the pair, one is alone.
-
-    By parallax over noise, times the root of the number of markers that both see at poses where they share
-    two or more: cameras far around see a tool from other sides.
-
-    Raises WorkFailed if no pair has an epipolar geometry.
-    """
-    V = len(detections.view)
-    if V <= 2:
-        return detections
-    found, failure = list[tuple[float, tuple[int, int]]](), None
-    for pair in combinations(range(V), 2):
-        some = detections.of_views([*pair])
-        try:
-            epipolar = Epipolar.of(some, np.random.default_rng(0))
-        except WorkFailed as error:
-            failure = error
-            continue
-        shared = np.bincount(some.pose_of[some.both])
-        strength = float(np.sqrt(shared[shared > 1].sum())) * epipolar.parallax_px / epipolar.noise_px
-        found.append((strength, pair))
-    if not found and failure is not None:
-        raise failure
-    return dataclasses.replace(detections, pair=max(found)[1])
 
 
 def with_all_views(of_pair: Solution, whole: Detections, epipolar: ImageGeometry) -> Solution:
@@ -93,45 +61,6 @@ def with_all_views(of_pair: Solution, whole: Detections, epipolar: ImageGeometry
             "show the same poses"
         )
     return solution
-
-
-def with_own_noise(solution: Solution, epipolar: ImageGeometry) -> tuple[Solution, ImageGeometry]:
-    """Weigh each view by its own noise until it settles; also the epipolar geometry of the quietest pair.
-
-    In units of the root mean square noise of this pair. Two views share one noise, which their epipolar
-    geometry shows.
-    """
-    if len(solution.used) <= 2:
-        return solution, epipolar
-    first_pair = solution.problem.detections.pair
-    for _ in range(_NOISE_ROUNDS):
-        detections = solution.problem.detections
-        noise = np.array([_noise(solution, v) for v in range(len(solution.used))])
-        first, second = np.sort(np.argsort(noise / detections.weight.max(axis=1))[:2]).tolist()
-        noise /= np.sqrt(np.mean(noise[[first, second]] ** 2))
-        if np.abs(np.log(noise)).max() <= _SETTLED:
-            break
-        weight = detections.weight / noise[:, None]
-        weighed = dataclasses.replace(detections, weight=weight, pair=(first, second))
-        problem = dataclasses.replace(solution.problem, detections=weighed)
-        found = fit_inliers(problem, solution.params, solution.typical_px / RAYLEIGH, epipolar.noise_px)
-        if found is None:
-            break
-        solution = found
-    seen = undistorted(solution.problem.detections, solution.params.lens)
-    try:
-        return solution, Epipolar.of(seen, np.random.default_rng(0))
-    except WorkFailed:  # without a baseline: the first pair has one
-        detections = dataclasses.replace(solution.problem.detections, pair=first_pair)
-        problem = dataclasses.replace(solution.problem, detections=detections)
-        seen = dataclasses.replace(seen, pair=first_pair)
-        return dataclasses.replace(solution, problem=problem), Epipolar.of(seen, np.random.default_rng(0))
-
-
-def _noise(solution: Solution, v: int) -> float:
-    """Robust noise of a view per coordinate, weighted, px: of all that was seen, so that none is cut off."""
-    distance = np.linalg.norm(solution.residual[v, solution.problem.detections.seen[v]], axis=1)
-    return max(float(np.median(distance)) / RAYLEIGH, 1e-9)
 
 
 def resected(points: FloatArray, pixels: FloatArray) -> FloatArray:
