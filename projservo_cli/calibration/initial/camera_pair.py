@@ -5,9 +5,7 @@ from itertools import combinations
 
 import numpy as np
 
-from projservo_cli.calibration.detections import (
-    Detections,
-)
+from projservo_cli.calibration.detections import Detections
 from projservo_cli.calibration.initial.epipolar import Epipolar
 from projservo_cli.records import WorkFailed
 
