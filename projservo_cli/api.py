@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from projservo_cli import plugins
-from projservo_cli.chain.making import require_simulated
+from projservo_cli.chain.execution import require_simulated
 from projservo_cli.chain.progress import Listener
 from projservo_cli.config import Config, Override, checked_values, overridden, to_yaml
 from projservo_cli.config.inputs import (
@@ -27,7 +27,7 @@ from projservo_cli.config.inputs import (
 from projservo_cli.config.sweep import SweepConfig
 from projservo_cli.experiment import Experiment, law_target, plan_scene_of
 from projservo_cli.laws import CODES, REGULATE, law_and_mode, run_name, run_names
-from projservo_cli.loop.compilation import compilation
+from projservo_cli.loop.jit_notice import compilation
 from projservo_cli.observations import Observations, require_observations
 from projservo_cli.records import Calibration, FloatArray, InputError, JointList, Plan
 from projservo_cli.result_hashes import File
@@ -41,14 +41,14 @@ from projservo_cli.stages import servo as driving
 from projservo_cli.stages.stage_inputs import Estimation, RefitInputs, Trials
 from projservo_cli.stages.worlds.external_robot import plugin_robot
 from projservo_cli.store.display import checked_array, numbers_in, require_radians
-from projservo_cli.store.files import working_in, writing
+from projservo_cli.store.files_and_locks import working_in, writing
 from projservo_cli.store.run_file import load as stored_run
 from projservo_cli.store.run_file import run_path
 from projservo_cli.store.sweep_table import TABLE, SweepTable
 from projservo_cli.sweeps.design import Design, require_sound
-from projservo_cli.sweeps.engine import Engine
 from projservo_cli.sweeps.folder import Folder, run_sweep
 from projservo_cli.sweeps.statistics import Study
+from projservo_cli.sweeps.workers import Engine
 from projservo_cli.words import sentence
 
 _WITHOUT_TASKS = 20  # default runs of a cell

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from projservo_cli import plugins
-from projservo_cli.chain.making import FIGURES, Chain
+from projservo_cli.chain.execution import FIGURES, Chain
 from projservo_cli.chain.outdated import STAGES
 from projservo_cli.chain.progress import Listener
 from projservo_cli.config import Config, load_config, overridden, shipped, to_goals
@@ -21,7 +21,7 @@ from projservo_cli.records import Calibration, InputError, Observation, WorkFail
 from projservo_cli.results import HeldOutErrors, ImageModel, MotionPlan, PlanScene, RunTrace, WrittenReport
 from projservo_cli.stages import Progress
 from projservo_cli.store.display import Printed
-from projservo_cli.store.files import working_in
+from projservo_cli.store.files_and_locks import working_in
 from projservo_cli.store.run_file import Result, Run, stored
 
 

@@ -6,10 +6,10 @@ from types import ModuleType
 from typing import Any
 
 from projservo_cli.config import inputs as given
-from projservo_cli.config import load_config, whole
+from projservo_cli.config import load_config, settings_and_rules
 from projservo_cli.report import page
 from projservo_cli.settings.sections import JointVector
-from projservo_cli.simulation import faults, streams, workspace
+from projservo_cli.simulation import faults, ground_truth, random_streams
 from projservo_cli.simulation.rendering import Frames, rendered_model
 from projservo_cli.stages import calibrate as calibrating
 from projservo_cli.stages import plan as planning
@@ -19,7 +19,7 @@ from projservo_cli.stages import scenario
 from projservo_cli.stages import servo as driving
 from projservo_cli.stages import teach as teaching
 
-truth_of = whole.truth_of
+truth_of = settings_and_rules.truth_of
 
 
 class _Stage:
@@ -42,7 +42,7 @@ def trial_motions(config):
 
 def simulate(config, truth, q=None, drawn=None):
     q = trial_motions(config) if q is None else q
-    drawn = drawn or (trials_of(config).motions.seed, streams.CALIBRATION_NOISE)
+    drawn = drawn or (trials_of(config).motions.seed, random_streams.CALIBRATION_NOISE)
     return recording.noisy_observation(truth, q, config.noise.calibration_px, drawn)
 
 
@@ -105,7 +105,7 @@ def eyes_of(config):
 
 
 def plant_of(config, truth, q):
-    return workspace.plant_of(truth, q, opaque=config.plant.self_occlusion == "opaque")
+    return ground_truth.plant_of(truth, q, opaque=config.plant.self_occlusion == "opaque")
 
 
 def checked(config, calibration, taught):

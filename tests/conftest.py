@@ -60,12 +60,12 @@ def reference_truth(shared_data):
 @pytest.fixture(scope="session", autouse=True)
 def quick():
     """Nothing is forced onto the disk, which may take its time; no figure is drawn by another process."""
-    from projservo_cli.report import drawing
-    from projservo_cli.store import files
+    from projservo_cli.report import figure_processes
+    from projservo_cli.store import files_and_locks
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(files, "_synchronise", lambda path: None)
-        patch.setattr(drawing, "PROCESSORS", 1)
+        patch.setattr(files_and_locks, "_synchronise", lambda path: None)
+        patch.setattr(figure_processes, "PROCESSORS", 1)
         yield
 
 

@@ -10,11 +10,11 @@ from projservo_cli.control.law import ERRORS, Gains, new_state
 from projservo_cli.geometry.lens import distort
 from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.laws import CODES, INCIDENCES
-from projservo_cli.loop.compiled import Course, run_compiled
+from projservo_cli.loop.compiled_loop import Course, run_compiled
 from projservo_cli.loop.verdicts import VERDICT_NAMES, Limits, new_log
 from projservo_cli.records import FloatArray, Model, position_limits
 from projservo_cli.simulation.analytic_plant import Plant
-from projservo_cli.task.body import make_body
+from projservo_cli.task.body_pose import make_body
 from projservo_cli.task.face import MIDPOINT, Task, center_of, cyclic_order, face_plane
 from projservo_cli.task.target import Goal, TaskImages
 from tests.samples import METRIC_A_INF, arm, face, in_frame, pixels, poe

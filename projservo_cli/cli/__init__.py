@@ -4,18 +4,27 @@ Importing it imports click alone: commands are functions of the modules below, w
 when they run.
 """
 
-from projservo_cli.cli import stages  # isort: skip  # first in the help
-from projservo_cli.cli import data, hardware, inspection, installation, servos, sweep_command
+# The order of the commands in the help.
+# isort: off
+from projservo_cli.cli import stage_commands
+from projservo_cli.cli import teach_detect_validate
+from projservo_cli.cli import tags_doctor
+from projservo_cli.cli import show_compare_export
+from projservo_cli.cli import init_schema_bench
+from projservo_cli.cli import limits_release
+from projservo_cli.cli import sweep_command
 from projservo_cli.cli.program import main, run
 
+# isort: on
+
 __all__ = [
-    "data",
-    "hardware",
-    "inspection",
-    "installation",
+    "init_schema_bench",
+    "limits_release",
     "main",
     "run",
-    "servos",
-    "stages",
+    "show_compare_export",
+    "stage_commands",
     "sweep_command",
+    "tags_doctor",
+    "teach_detect_validate",
 ]

@@ -46,11 +46,11 @@ def _sweep(
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # in the processes to come, from their beginning
     from projservo_cli.config import load_sweep
-    from projservo_cli.store.files import working_in
+    from projservo_cli.store.files_and_locks import working_in
     from projservo_cli.store.sweep_table import SweepTable
     from projservo_cli.sweeps.design import read_design
-    from projservo_cli.sweeps.engine import Cluster, Engine
     from projservo_cli.sweeps.folder import Folder, run_sweep
+    from projservo_cli.sweeps.workers import Cluster, Engine
 
     design = read_design(load_sweep(config, sets))
     folder = Folder(output or Path("results") / design.sweep.name)

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from projservo_cli.config.loading import Config, stored_yaml
-from projservo_cli.config.whole import carriers_of, truth_of
+from projservo_cli.config.settings_and_rules import carriers_of, truth_of
 from projservo_cli.records import ANGLE, MEET, PARALLEL, PERPENDICULAR, TOOL, InputError
 from projservo_cli.result_hashes import File
 from projservo_cli.settings.control import LawSettings, Rest, RunConditions, ServoLimits, SpeedLimits
@@ -23,16 +23,16 @@ from projservo_cli.settings.markers import Markers
 from projservo_cli.settings.objects import ObjectSettings
 from projservo_cli.settings.task import Goal as GoalSettings
 from projservo_cli.settings.trials import LoopNoise
-from projservo_cli.simulation.described import (
+from projservo_cli.simulation.faults import SimulatedRobot
+from projservo_cli.simulation.from_settings import (
     arm_of,
     cameras_of,
     center_in_face,
     described_scene,
 )
-from projservo_cli.simulation.faults import SimulatedRobot
+from projservo_cli.simulation.ground_truth import SceneObject, Truth
 from projservo_cli.simulation.mjcf import files_named
 from projservo_cli.simulation.rendering import RenderedScene
-from projservo_cli.simulation.workspace import SceneObject, Truth
 from projservo_cli.stages.stage_inputs import (
     CalibrationInputs,
     CarryingObject,

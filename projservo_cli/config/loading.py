@@ -21,18 +21,18 @@ import yaml
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
+from projservo_cli.config.settings_and_rules import Settings, truth_of
 from projservo_cli.config.sweep import SweepConfig
-from projservo_cli.config.whole import Settings, truth_of
 from projservo_cli.passwords import masked
 from projservo_cli.records import FloatArray, InputError
 from projservo_cli.settings.control import RENDERED, RenderedOptions
 from projservo_cli.settings.sections import CONTRADICTIONS, Note, Section
 from projservo_cli.settings.task import CURRENT
-from projservo_cli.simulation.described import arm_of
+from projservo_cli.simulation.from_settings import arm_of
 from projservo_cli.simulation.mjcf import read_mjcf
 from projservo_cli.simulation.urdf import read_urdf
 from projservo_cli.store.display import checked_array, plain, require_radians
-from projservo_cli.store.files import bytes_of, text_of
+from projservo_cli.store.files_and_locks import bytes_of, text_of
 
 try:  # of a text of the largest size, libyaml makes nodes in half a second, PyYAML itself in five
     from yaml import CSafeDumper as _Emitter

@@ -10,7 +10,7 @@ import math
 from projservo_cli.control.law import LOST, OK, SINGULAR, Gains, State, measure
 from projservo_cli.geometry.algebra import Mat4, apply, dot, inverse, mat, vec
 from projservo_cli.geometry.jit import inline, internal, merged
-from projservo_cli.geometry.kernels import least_squares, minimum_norm
+from projservo_cli.geometry.null_space import least_squares, minimum_norm
 from projservo_cli.records import FloatArray, Model
 from projservo_cli.task.face import MIDPOINT, Task, center_of
 from projservo_cli.task.incidences import SHOWN, linearize_into, points_away, rank_of, turn_rate

@@ -29,7 +29,6 @@ from projservo_cli.geometry.algebra import (
 )
 from projservo_cli.geometry.displacements import composed_angle, composed_operator
 from projservo_cli.geometry.jit import inline, internal, merged, njit, separate
-from projservo_cli.geometry.kernels import COORDINATES, least_squares
 from projservo_cli.geometry.kinematics import image_velocity, operators_at, row
 from projservo_cli.geometry.lens import undistort_pixel
 from projservo_cli.geometry.mechanisms import (
@@ -41,9 +40,10 @@ from projservo_cli.geometry.mechanisms import (
     rows_of,
     workspace,
 )
+from projservo_cli.geometry.null_space import COORDINATES, least_squares
 from projservo_cli.geometry.stereo import triangulate
 from projservo_cli.records import VIEWS, FloatArray, IntArray, JointLimits, Model, position_limits
-from projservo_cli.task.body import ALL_VIEWS, GOAL_VIEWS, carry, fit_body
+from projservo_cli.task.body_pose import ALL_VIEWS, GOAL_VIEWS, carry, fit_body
 from projservo_cli.task.face import Task, center_of
 from projservo_cli.task.incidences import image_error, rank_of
 from projservo_cli.task.partition import NO_PARTS, Parts, Split, partition

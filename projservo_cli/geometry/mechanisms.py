@@ -26,7 +26,8 @@ from projservo_cli.geometry.algebra import (
 )
 from projservo_cli.geometry.displacements import invariant_rotations
 from projservo_cli.geometry.jit import internal, merged, separate
-from projservo_cli.geometry.kernels import (
+from projservo_cli.geometry.kinematics import joint_operators, operators_at
+from projservo_cli.geometry.null_space import (
     COORDINATES,
     System,
     kernel_vector,
@@ -34,7 +35,6 @@ from projservo_cli.geometry.kernels import (
     minimum_norm,
     new_system,
 )
-from projservo_cli.geometry.kinematics import joint_operators, operators_at
 from projservo_cli.records import FloatArray, Model
 
 # Norm of an operator, over that of its terms, below which a kernel vector moves no point.

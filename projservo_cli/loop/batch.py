@@ -19,13 +19,13 @@ from projservo_cli.control.law import (
 )
 from projservo_cli.geometry.jit import inline, merged, njit
 from projservo_cli.geometry.lens import undistort_into
-from projservo_cli.loop.compiled import Course, run_compiled
-from projservo_cli.loop.rehearsal import Rehearsal, first_parts, is_half_turn
+from projservo_cli.loop.compiled_loop import Course, run_compiled
 from projservo_cli.loop.run_metrics import Ended, Summary, summarize
+from projservo_cli.loop.task_start import Rehearsal, first_parts, is_half_turn
 from projservo_cli.loop.verdicts import RUNNING, Log, new_log
 from projservo_cli.records import FloatArray, IntArray, Model
 from projservo_cli.simulation.analytic_plant import Ends
-from projservo_cli.task.body import Body
+from projservo_cli.task.body_pose import Body
 from projservo_cli.task.face import (
     FOUND,
     Task,

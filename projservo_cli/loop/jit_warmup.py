@@ -16,10 +16,10 @@ from numba import typeof
 from projservo_cli.control import FUNCTIONS, address_of
 from projservo_cli.control.law import ERRORS, Law, example
 from projservo_cli.geometry.jit import CACHE_FOLDER, is_cached
-from projservo_cli.loop.compiled import Course, run_compiled
+from projservo_cli.loop.compiled_loop import Course, run_compiled
 from projservo_cli.loop.run_metrics import Ended, path_deviation, summarize
 from projservo_cli.loop.verdicts import Limits, new_log
-from projservo_cli.planning.margins import Reaching, carried_into, carrier_of, limits_alone, room_along
+from projservo_cli.planning.motion_margins import Reaching, carried_into, carrier_of, limits_alone, room_along
 from projservo_cli.simulation.analytic_plant import Ends, Plant
 
 

@@ -15,7 +15,7 @@ from typing import Protocol
 import numpy as np
 
 from projservo_cli.findings import NOTE, Finding, Subject
-from projservo_cli.loop.python import BuiltInLaw
+from projservo_cli.loop.python_loop import BuiltInLaw
 from projservo_cli.loop.stall_monitor import StallMonitor
 from projservo_cli.loop.verdicts import (
     CONVERGED,

@@ -2,8 +2,8 @@
 
 Of several verdicts at one instant ``verdict_at`` gives the first of ``behind camera``, ``out of view``,
 ``markers lost``, ``converged``, ``diverged``, ``singular``, ``no progress`` or ``max steps``, and ``joint
-limit``; ``loop.python`` states what rules before and after it. ``words.reasons`` has their causes. A command
-that would pass a limit is shortened to end there.
+limit``; ``loop.python_loop`` states what rules before and after it. ``words.reasons`` has their causes. A
+command that would pass a limit is shortened to end there.
 
 While markers are lost the robot is held where it is for up to ``max_lost_periods`` periods in a row; the run
 goes on when they are seen again.

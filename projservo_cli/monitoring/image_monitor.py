@@ -9,8 +9,8 @@ from projservo_cli.calibration.detections import even_choice
 from projservo_cli.calibration.prediction import CAMERA
 from projservo_cli.deviations import MARKERS
 from projservo_cli.findings import REFUSES, Finding, Subject
-from projservo_cli.monitoring.accuracy import Posture
-from projservo_cli.monitoring.causes import finding_of, group_of, is_slight, misplaced_tags
+from projservo_cli.monitoring.arrival_accuracy import Posture
+from projservo_cli.monitoring.fault_findings import finding_of, group_of, is_slight, misplaced_tags
 from projservo_cli.monitoring.frame_pairs import FramePair, Pairing, TimedImage, mean_image
 from projservo_cli.monitoring.hypotheses import (
     Evidence,

@@ -12,9 +12,9 @@ import numpy as np
 
 from projservo_cli.geometry.algebra import Vec4, apply, mat, sub, vec, vec_into, wrapped_angle
 from projservo_cli.geometry.jit import internal, merged, njit
-from projservo_cli.geometry.kernels import row_into, solve_normal
 from projservo_cli.geometry.kinematics import forward, image_velocity, operators_at
-from projservo_cli.planning.constraints import (
+from projservo_cli.geometry.null_space import row_into, solve_normal
+from projservo_cli.planning.joint_constraints import (
     DEVIATIONS,
     FINE_PX,
     Constraints,
@@ -25,7 +25,7 @@ from projservo_cli.planning.constraints import (
     new_trial,
     twin_of,
 )
-from projservo_cli.planning.margins import FRONT, IMAGE, column, straight_pixel
+from projservo_cli.planning.motion_margins import FRONT, IMAGE, column, straight_pixel
 from projservo_cli.records import FloatArray
 
 # Maximum number of Newton steps from one start.

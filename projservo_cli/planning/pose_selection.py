@@ -14,7 +14,7 @@ from projservo_cli.calibration.prediction import (
 )
 from projservo_cli.calibration.refit import errors_of_others, rows_of_camera
 from projservo_cli.image_size import image_corners, image_sizes
-from projservo_cli.planning.model_spread import Region, drawn_poses
+from projservo_cli.planning.prediction_covariance import Region, drawn_poses
 from projservo_cli.records import BoolArray, Calibration, FloatArray, Observation, WorkFailed
 
 # The range of the recorded readings is widened at each end by this share of itself; for a robot

@@ -13,9 +13,9 @@ from typing import NamedTuple
 import numpy as np
 
 from projservo_cli.geometry.jit import merged, njit
-from projservo_cli.geometry.kernels import row_into
-from projservo_cli.planning.constraints import time_between
-from projservo_cli.planning.margins import (
+from projservo_cli.geometry.null_space import row_into
+from projservo_cli.planning.joint_constraints import time_between
+from projservo_cli.planning.motion_margins import (
     IMAGE,
     OF_MOTION,
     VISIBILITY,

@@ -11,7 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from projservo_cli.geometry.jit import internal, njit
-from projservo_cli.planning.constraints import (
+from projservo_cli.planning.goal_configurations import STARTS, UNSURE, GoalFeatures, goals_of
+from projservo_cli.planning.joint_constraints import (
     DEVIATIONS,
     SHARE,
     Constraints,
@@ -21,9 +22,8 @@ from projservo_cli.planning.constraints import (
     reached,
     time_between,
 )
-from projservo_cli.planning.goal_configurations import STARTS, UNSURE, GoalFeatures, goals_of
 from projservo_cli.planning.keep_out import only
-from projservo_cli.planning.margins import CLEAR, FRONT, IMAGE, JOINTS, column, columns
+from projservo_cli.planning.motion_margins import CLEAR, FRONT, IMAGE, JOINTS, column, columns
 from projservo_cli.planning.time_parameterization import TimedPath, minimum_time, time_parameterized
 from projservo_cli.records import NO_SPREAD, FloatArray, IntArray, JointLimits
 

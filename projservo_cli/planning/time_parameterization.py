@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from projservo_cli.geometry.jit import internal, merged, njit
-from projservo_cli.planning.constraints import Constraints, Trial, reached
+from projservo_cli.planning.joint_constraints import Constraints, Trial, reached
 from projservo_cli.records import FloatArray
 
 # Share of the limits of speed and acceleration that is planned with, so that feedback has room.

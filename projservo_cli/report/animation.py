@@ -29,7 +29,7 @@ from projservo_cli.report.html import html_page
 from projservo_cli.report.report_data import PAGE_FILE, title
 from projservo_cli.simulation.analytic_plant import Plant
 from projservo_cli.simulation.arm import SerialArm
-from projservo_cli.store.files import replacing, write_whole
+from projservo_cli.store.files_and_locks import replacing, write_whole
 from projservo_cli.task.face import center_of
 from projservo_cli.words.reasons import arrived
 

@@ -30,7 +30,7 @@ from projservo_cli.report.report_data import (
 )
 from projservo_cli.report.style import FORMATS
 from projservo_cli.store.display import About
-from projservo_cli.store.files import lies_inside, write_whole
+from projservo_cli.store.files_and_locks import lies_inside, write_whole
 from projservo_cli.store.run_file import Run
 from projservo_cli.words.reasons import arrived
 

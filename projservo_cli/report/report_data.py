@@ -17,7 +17,7 @@ from projservo_cli.findings import REFUSES, Finding, named, of_readings, told
 from projservo_cli.geometry.kinematics import project
 from projservo_cli.laws import IMAGE_TRACK, REGULATE, TRACK, law_and_mode, title_of
 from projservo_cli.metric.frame import Metric
-from projservo_cli.planning.margins import CONSTRAINTS, OF_MOTION
+from projservo_cli.planning.motion_margins import CONSTRAINTS, OF_MOTION
 from projservo_cli.records import (
     MM,
     WHY_LOST,

@@ -15,7 +15,7 @@ from projservo_cli.calibration.detections import MIN_SIGMA
 from projservo_cli.findings import LIMITS, REFUSES, Finding, Subject
 from projservo_cli.geometry.algebra import as_array
 from projservo_cli.geometry.kinematics import forward
-from projservo_cli.monitoring.at_rest import fault_of_mean
+from projservo_cli.monitoring.fault_at_rest import fault_of_mean
 from projservo_cli.monitoring.image_monitor import ImageMonitor
 from projservo_cli.monitoring.innovation_tests import WINDOW
 from projservo_cli.records import BoolArray, FloatArray, IntArray, WorkFailed

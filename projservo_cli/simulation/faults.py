@@ -20,10 +20,10 @@ from projservo_cli.geometry.kinematics import joint_operators
 from projservo_cli.records import ByteArray, FloatArray
 from projservo_cli.settings.disturbance import Events, Faults, JointMoved, LostMarkers, StuckEncoder
 from projservo_cli.simulation.arm import SerialArm
-from projservo_cli.simulation.physics import Physics
+from projservo_cli.simulation.ground_truth import SceneObject, Truth
+from projservo_cli.simulation.mujoco_servos import Physics
+from projservo_cli.simulation.random_streams import generator
 from projservo_cli.simulation.rendering import Frames, RenderedScene, rendered_model
-from projservo_cli.simulation.streams import generator
-from projservo_cli.simulation.workspace import SceneObject, Truth
 
 # Joints are worked out this often at least, s, and taken as straight lines between.
 _GRID_S = 0.005

@@ -10,7 +10,7 @@ from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.image_size import within_images
 from projservo_cli.records import FloatArray, InputError, IntArray, WorkFailed
 from projservo_cli.simulation.arm import METRIC_A_INF
-from projservo_cli.simulation.workspace import Truth
+from projservo_cli.simulation.ground_truth import Truth
 
 _RANGE = 0.9  # share of the range of a joint that is drawn from
 _LEAST_COSINE = math.cos(math.radians(75.0))  # of the angle between the normal of the face and a ray

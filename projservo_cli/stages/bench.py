@@ -17,8 +17,8 @@ from threadpoolctl import threadpool_limits
 from projservo_cli.control import make_law
 from projservo_cli.control.law import ERRORS, Law, State, new_state
 from projservo_cli.laws import CODES, INCIDENCES, LAWS
-from projservo_cli.loop.compiled import Course, many_steps, run_compiled
-from projservo_cli.loop.python import BuiltInLaw
+from projservo_cli.loop.compiled_loop import Course, many_steps, run_compiled
+from projservo_cli.loop.python_loop import BuiltInLaw
 from projservo_cli.loop.verdicts import Log, new_log
 from projservo_cli.records import FloatArray
 from projservo_cli.simulation.analytic_plant import Plant

@@ -28,7 +28,7 @@ from projservo_cli.records import (
     WorkFailed,
     changed,
 )
-from projservo_cli.simulation.streams import NORMAL, SUGGESTIONS, generator
+from projservo_cli.simulation.random_streams import NORMAL, SUGGESTIONS, generator
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.record import observed
 from projservo_cli.stages.stage_inputs import (
@@ -39,8 +39,8 @@ from projservo_cli.stages.stage_inputs import (
     Table,
     Trials,
 )
-from projservo_cli.store.files import write_whole
-from projservo_cli.store.nominal import read_nominal
+from projservo_cli.store.files_and_locks import write_whole
+from projservo_cli.store.nominal_robot import read_nominal
 from projservo_cli.store.observation_tables import mount_in, read_detections, read_table, to_csv
 from projservo_cli.words import lines, with_findings
 from projservo_cli.words.table import Setup

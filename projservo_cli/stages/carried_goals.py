@@ -15,7 +15,7 @@ from projservo_cli.robots.session import Session
 from projservo_cli.stages.scenario import Scenario
 from projservo_cli.stages.stage_inputs import CarryingObject, KnownLengths
 from projservo_cli.task.displaced_object import DisplacedObject
-from projservo_cli.task.look_bundle import Look, UncertainPoints
+from projservo_cli.task.object_bundle_adjustment import Look, UncertainPoints
 
 
 def in_metres(calibration: Calibration, known: KnownLengths) -> tuple[Metric | None, str]:

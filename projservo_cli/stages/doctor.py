@@ -16,11 +16,11 @@ from projservo_cli.hardware.checks_at_rest import RobotAtRest, findings_at_rest
 from projservo_cli.hardware.checks_in_motion import Strokes, findings_of, reach_of, strokes
 from projservo_cli.hardware.video_cameras import VideoCamera
 from projservo_cli.image_size import ImageSize, image_corners, image_sizes
-from projservo_cli.monitoring.accuracy import resting_error_mm
-from projservo_cli.monitoring.at_rest import fault_at_rest
+from projservo_cli.monitoring.arrival_accuracy import resting_error_mm
+from projservo_cli.monitoring.fault_at_rest import fault_at_rest
 from projservo_cli.monitoring.frame_pairs import at_known_markers, mean_image
-from projservo_cli.planning.model_spread import Region
 from projservo_cli.planning.pose_selection import RefitPoses, refit_poses
+from projservo_cli.planning.prediction_covariance import Region
 from projservo_cli.records import Calibration, FloatArray, InputError, Observation, WorkFailed
 from projservo_cli.robots.contract import PluginRobot, at_rest_after
 from projservo_cli.robots.pacing import Steered

@@ -11,17 +11,17 @@ from projservo_cli.control.law import State
 from projservo_cli.findings import LIMITS, NOTE, REFUSES, Finding, Subject, told, usable
 from projservo_cli.geometry.algebra import as_array, vec
 from projservo_cli.geometry.displacements import composed_angle
-from projservo_cli.geometry.kernels import COORDINATES, RANK_TOLERANCE
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators, project
 from projservo_cli.geometry.lens import undistort
+from projservo_cli.geometry.null_space import COORDINATES, RANK_TOLERANCE
 from projservo_cli.image_size import image_sizes
-from projservo_cli.loop.rehearsal import begin
-from projservo_cli.monitoring.accuracy import RigidFit, metric_points, rigid_fit
-from projservo_cli.monitoring.at_rest import fault_at_rest
-from projservo_cli.planning.constraints import constraints_of
-from projservo_cli.planning.goal_sets import goals_meeting
-from projservo_cli.planning.margins import Demands, Motion, Reaching, best_views
-from projservo_cli.planning.shown_joints import NEAR_PX, joints_showing
+from projservo_cli.loop.task_start import begin
+from projservo_cli.monitoring.arrival_accuracy import RigidFit, metric_points, rigid_fit
+from projservo_cli.monitoring.fault_at_rest import fault_at_rest
+from projservo_cli.planning.incidence_goals import goals_meeting
+from projservo_cli.planning.joint_constraints import constraints_of
+from projservo_cli.planning.joints_from_images import NEAR_PX, joints_showing
+from projservo_cli.planning.motion_margins import Demands, Motion, Reaching, best_views
 from projservo_cli.records import (
     NO_SPREAD,
     Calibration,
@@ -41,7 +41,7 @@ from projservo_cli.records import (
 from projservo_cli.robots.session import Session
 from projservo_cli.settings.task import Trajectory
 from projservo_cli.stages.carried_goals import carried_by
-from projservo_cli.stages.motions import (
+from projservo_cli.stages.plan_motion import (
     Found,
     JointSearch,
     body_at_start,
@@ -55,8 +55,8 @@ from projservo_cli.stages.motions import (
 from projservo_cli.stages.plan_summary import findings_on, relaxed, search_summary, verdict_of
 from projservo_cli.stages.scenario import Scenario, scenario_of
 from projservo_cli.stages.stage_inputs import PlanInputs
-from projservo_cli.task.contradictions import contradictions
 from projservo_cli.task.face import Task, center_of, face_plane
+from projservo_cli.task.incidence_contradictions import contradictions
 from projservo_cli.task.incidences import errors_px, free_motions
 from projservo_cli.task.partition import Parts
 from projservo_cli.task.target import TaskImages

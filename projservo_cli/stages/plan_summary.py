@@ -8,8 +8,8 @@ import numpy as np
 
 from projservo_cli.findings import NOTE, REFUSES, Finding, Subject
 from projservo_cli.image_size import BEHIND
-from projservo_cli.planning.constraints import Constraints, demands_into, margins_along_into, new_trial
-from projservo_cli.planning.margins import (
+from projservo_cli.planning.joint_constraints import Constraints, demands_into, margins_along_into, new_trial
+from projservo_cli.planning.motion_margins import (
     CONSTRAINTS,
     IMAGE,
     JOINTS,

@@ -28,18 +28,18 @@ from projservo_cli.records import (
     JointList,
     Observation,
 )
-from projservo_cli.report.live_page import annotated, recording_page
+from projservo_cli.report.image_pages import annotated, recording_page
 from projservo_cli.robots.contract import PluginRobot, Reading, at_rest_after
 from projservo_cli.robots.joint_limits import Joints
 from projservo_cli.robots.pacing import Steered
 from projservo_cli.robots.standstill import averaged
 from projservo_cli.simulation.faults import robot_by_itself
-from projservo_cli.simulation.streams import CALIBRATION_NOISE, POSE_NOISE, TRIAL_POSES, generator
-from projservo_cli.simulation.workspace import Truth
+from projservo_cli.simulation.ground_truth import Truth
+from projservo_cli.simulation.random_streams import CALIBRATION_NOISE, POSE_NOISE, TRIAL_POSES, generator
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.stage_inputs import OwnRobot, RecordingInputs, Trials
 from projservo_cli.stages.worlds.external_robot import path_to, plugin_robot, simulated_robot
-from projservo_cli.store.files import write_whole
+from projservo_cli.store.files_and_locks import write_whole
 from projservo_cli.store.observation_tables import identity_in, read_table, recording_of, write_table
 from projservo_cli.words.table import Setup
 

@@ -24,12 +24,12 @@ from projservo_cli.geometry.displacements import (
 )
 from projservo_cli.image_size import ImageSize
 from projservo_cli.laws import TRACK, run_name
-from projservo_cli.planning.margins import limits_alone
+from projservo_cli.planning.motion_margins import limits_alone
 from projservo_cli.records import VIEWS, Calibration, FloatArray, Model, Plan, Report, Trace, WorkFailed
 from projservo_cli.report import style
 from projservo_cli.report.animation import motion_of, write_animation, write_view
 from projservo_cli.report.claims import claims_of
-from projservo_cli.report.drawing import Drawing, SecondProcess
+from projservo_cli.report.figure_processes import Drawing, SecondProcess
 from projservo_cli.report.figures import FIGURES
 from projservo_cli.report.figures.path_deviation import drift_rows, study_numbers
 from projservo_cli.report.figures.scene import chosen_poses, metric_rows
@@ -45,7 +45,7 @@ from projservo_cli.report.report_data import (
     ReportData,
     Studies,
 )
-from projservo_cli.simulation.workspace import Truth, plant_of
+from projservo_cli.simulation.ground_truth import Truth, plant_of
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.carried_goals import in_metres
 from projservo_cli.stages.plan import plan_task
@@ -53,10 +53,10 @@ from projservo_cli.stages.runs.run_trace import trace_of
 from projservo_cli.stages.scenario import RunScenario, run_scenario
 from projservo_cli.stages.servo import drive
 from projservo_cli.stages.stage_inputs import ReportInputs, Scenery, ServoInputs
-from projservo_cli.store.files import replacing, require_inside, write_whole
+from projservo_cli.store.files_and_locks import replacing, require_inside, write_whole
 from projservo_cli.store.observation_tables import to_csv
 from projservo_cli.store.run_file import Result, Run
-from projservo_cli.task.body import make_body
+from projservo_cli.task.body_pose import make_body
 from projservo_cli.task.face import cyclic_order
 from projservo_cli.task.target import is_stereo
 

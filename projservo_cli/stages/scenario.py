@@ -18,9 +18,9 @@ from projservo_cli.geometry.kinematics import project
 from projservo_cli.image_size import image_sizes
 from projservo_cli.laws import BODY_LAWS, LAW_SPECS
 from projservo_cli.loop.verdicts import Limits
-from projservo_cli.monitoring.accuracy import metres_a_unit
-from projservo_cli.planning.margins import Demands
-from projservo_cli.planning.shown_joints import NEAR_PX, joints_showing
+from projservo_cli.monitoring.arrival_accuracy import metres_a_unit
+from projservo_cli.planning.joints_from_images import NEAR_PX, joints_showing
+from projservo_cli.planning.motion_margins import Demands
 from projservo_cli.records import (
     CORNERS,
     TOOL,
@@ -35,7 +35,7 @@ from projservo_cli.records import (
     WorkFailed,
 )
 from projservo_cli.simulation.analytic_plant import Ends, Plant
-from projservo_cli.simulation.workspace import Truth
+from projservo_cli.simulation.ground_truth import Truth
 from projservo_cli.stages.stage_inputs import CarryingObject, PlanInputs, ServoInputs
 from projservo_cli.stages.worlds.calibrated import CalibratedWorld, measures_points, observed_numbers
 from projservo_cli.stages.worlds.simulated import RenderedWorld, SimulatedWorld

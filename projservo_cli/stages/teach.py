@@ -14,7 +14,7 @@ from projservo_cli.calibration.prediction import predict
 from projservo_cli.findings import LIMITS, REFUSES, Finding, Subject
 from projservo_cli.hardware.checks_at_rest import MIN_SHARED
 from projservo_cli.image_size import image_sizes
-from projservo_cli.monitoring.at_rest import fault_at_rest
+from projservo_cli.monitoring.fault_at_rest import fault_at_rest
 from projservo_cli.records import (
     BoolArray,
     Calibration,
@@ -30,7 +30,7 @@ from projservo_cli.robots.standstill import frames_of, seen_at_rest
 from projservo_cli.settings.sections import JointVector
 from projservo_cli.settings.task import Goal, GoalImages, TaskSettings, sigma_key
 from projservo_cli.simulation.faults import FaultyRobot, SimulatedRobot, robot_by_itself
-from projservo_cli.simulation.streams import TAUGHT_NOISE, generator
+from projservo_cli.simulation.random_streams import TAUGHT_NOISE, generator
 from projservo_cli.stages import plan as planning
 from projservo_cli.stages.record import shared_markers
 from projservo_cli.stages.stage_inputs import OwnRobot, PlanInputs, TeachInputs

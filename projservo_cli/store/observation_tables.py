@@ -39,7 +39,7 @@ from projservo_cli.records import (
     JointList,
     Observation,
 )
-from projservo_cli.store.files import lines_of, write_whole
+from projservo_cli.store.files_and_locks import lines_of, write_whole
 
 _MAX_JOINTS = 64  # maximum number of joints, as in a configuration
 _MAX_COLUMNS = 10_000  # maximum number of columns

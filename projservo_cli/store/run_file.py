@@ -51,7 +51,7 @@ from projservo_cli.records import (
     part_of,
     scalars_of,
 )
-from projservo_cli.store.files import replacing
+from projservo_cli.store.files_and_locks import replacing
 from projservo_cli.words import line, sentence, setup_of
 from projservo_cli.words.reasons import arrived
 

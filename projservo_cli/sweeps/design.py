@@ -14,8 +14,8 @@ import numpy as np
 
 from projservo_cli.config import Config, Override, load_config, overridden, to_yaml
 from projservo_cli.config.inputs import calibration_inputs
+from projservo_cli.config.settings_and_rules import truth_of
 from projservo_cli.config.sweep import BASE, LAW, Distribution, SweepConfig
-from projservo_cli.config.whole import truth_of
 from projservo_cli.laws import law_and_mode, run_names
 from projservo_cli.plugin_hashes import source_hash
 from projservo_cli.records import InputError, IntArray

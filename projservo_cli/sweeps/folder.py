@@ -24,16 +24,16 @@ from projservo_cli.config.inputs import servo_inputs
 from projservo_cli.geometry.jit import CACHE_FOLDER, is_cached
 from projservo_cli.laws import codes_of
 from projservo_cli.loop.batch import until_rehearsal
-from projservo_cli.loop.compiled import run_compiled
+from projservo_cli.loop.compiled_loop import run_compiled
 from projservo_cli.loop.jit_warmup import are_cached
 from projservo_cli.records import Calibration, CrossValidation, InputError, Observation, WorkFailed
 from projservo_cli.stages import Progress, calibrate
-from projservo_cli.store.files import write_whole
+from projservo_cli.store.files_and_locks import write_whole
 from projservo_cli.store.run_file import Result, Run, load, save
 from projservo_cli.store.sweep_table import TABLE, SweepTable, assemble, write_part
 from projservo_cli.sweeps.design import Design, name_of_run
-from projservo_cli.sweeps.engine import Engine, versions
 from projservo_cli.sweeps.runs import Part, columns_of, is_compiled, run_part
+from projservo_cli.sweeps.workers import Engine, versions
 
 _REFUSED = ".refused"  # a calibration that cannot be made leaves a file with the reason
 _PARTS = 4  # of each worker at least

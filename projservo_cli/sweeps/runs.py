@@ -10,10 +10,10 @@ import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
 from projservo_cli.config.inputs import servo_inputs
-from projservo_cli.geometry.kernels import COORDINATES
+from projservo_cli.geometry.null_space import COORDINATES
 from projservo_cli.laws import CODES
 from projservo_cli.loop.batch import NUMBERS, VERDICT, Batch, Setting
-from projservo_cli.loop.compiled import Course
+from projservo_cli.loop.compiled_loop import Course
 from projservo_cli.loop.verdicts import INTERRUPTED, RUNNING, VERDICT_NAMES
 from projservo_cli.records import (
     VIEWS,

@@ -21,7 +21,7 @@ from projservo_cli.report.figures.sweep_success import draw_basin, pictures, wil
 from projservo_cli.results import RunTrace
 from projservo_cli.stages import Progress
 from projservo_cli.store.display import Displayable, pandas, xarray
-from projservo_cli.store.files import write_whole
+from projservo_cli.store.files_and_locks import write_whole
 from projservo_cli.store.observation_tables import to_csv
 from projservo_cli.store.sweep_table import Failure, SweepTable
 

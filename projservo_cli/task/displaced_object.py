@@ -1,7 +1,8 @@
 """Displacement of an object that a goal was taught on, and the goal carried along with it.
 
-Its points and displacements are those of ``look_bundle``. Where the joints leave the metric open, the
-displacement is affine, for which a look needs four markers off one plane instead of three off one line.
+Its points and displacements are those of ``object_bundle_adjustment``. Where the joints leave the metric
+open, the displacement is affine, for which a look needs four markers off one plane instead of three off one
+line.
 
 Errors are those of all images and of the calibration, to first order. A calibration that is off displaces the
 object and the tool alike: what both errors have in common drops out of the images of the carried goal.
@@ -34,7 +35,7 @@ from projservo_cli.records import (
     IntArray,
     WorkFailed,
 )
-from projservo_cli.task.look_bundle import (
+from projservo_cli.task.object_bundle_adjustment import (
     Bundle,
     BundleFit,
     Look,

@@ -11,7 +11,7 @@ from projservo_cli.geometry.algebra import Vec4, add, axpy, dot, meet, scale, su
 from projservo_cli.geometry.jit import inline, merged, njit
 from projservo_cli.geometry.stereo import fundamental_matrix, optical_centers, points_into
 from projservo_cli.records import VIEWS, FloatArray, IntArray, Model, WorkFailed
-from projservo_cli.task.body import NO_BODY, Body
+from projservo_cli.task.body_pose import NO_BODY, Body
 from projservo_cli.task.incidences import NO_INCIDENCES, Incidences
 from projservo_cli.task.trajectory import NO_REFERENCE, Reference
 

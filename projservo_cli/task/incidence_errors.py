@@ -13,10 +13,10 @@ from scipy.linalg import expm
 
 from projservo_cli.geometry.displacements import generators
 from projservo_cli.metric.frame import changes_of
-from projservo_cli.monitoring.accuracy import metres_by
+from projservo_cli.monitoring.arrival_accuracy import metres_by
 from projservo_cli.records import MEET, MM, PARALLEL, PERPENDICULAR, Calibration, FloatArray, WorkFailed
 from projservo_cli.task.incidences import Incidence, points_of
-from projservo_cli.task.look_bundle import NO_POINTS, BundleFit, Look, LookRig, UncertainPoints
+from projservo_cli.task.object_bundle_adjustment import NO_POINTS, BundleFit, Look, LookRig, UncertainPoints
 
 # Angle between features, rad, by their relation.
 _WANTED = {MEET: 0.0, PARALLEL: 0.0, PERPENDICULAR: 0.5 * np.pi}

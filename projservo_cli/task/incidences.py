@@ -22,9 +22,9 @@ from scipy.linalg import null_space, qr
 from projservo_cli.geometry.algebra import Mat4, apply, apply_transposed, as_array, dot, mat, meet, unit, vec
 from projservo_cli.geometry.displacements import to_all_sides, twist_exponential
 from projservo_cli.geometry.jit import inline, merged, njit
-from projservo_cli.geometry.kernels import COORDINATES
 from projservo_cli.geometry.kinematics import image_jacobian, project
 from projservo_cli.geometry.least_squares import Equations, levenberg_marquardt
+from projservo_cli.geometry.null_space import COORDINATES
 from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.metric.frame import invariant_upgrade
 from projservo_cli.records import (
@@ -38,7 +38,7 @@ from projservo_cli.records import (
     Model,
     WorkFailed,
 )
-from projservo_cli.task.body import Body
+from projservo_cli.task.body_pose import Body
 
 # Variance of a combination of errors, of unit variance each, below which it depends on the others.
 _DEPENDENT = 1e-9

@@ -11,9 +11,9 @@ from scipy.optimize import brentq
 
 from projservo_cli.geometry.kinematics import project
 from projservo_cli.geometry.stereo import optical_centers
-from projservo_cli.monitoring.accuracy import metric_points
+from projservo_cli.monitoring.arrival_accuracy import metric_points
 from projservo_cli.records import BoolArray, FloatArray, InputError, Model, WorkFailed
-from projservo_cli.task.body import Body
+from projservo_cli.task.body_pose import Body
 from projservo_cli.task.incidences import Flat, JointMetric, plane_through, points_of
 
 # Doublings of the way in search of one that moves images far enough, from this share of the first.

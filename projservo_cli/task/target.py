@@ -9,12 +9,12 @@ import numpy as np
 from projservo_cli.geometry.algebra import as_array, mat_into, mul
 from projservo_cli.geometry.displacements import translation
 from projservo_cli.geometry.jit import inline
-from projservo_cli.geometry.kernels import COORDINATES
 from projservo_cli.geometry.kinematics import forward, forward_kinematics, operators_at, project
 from projservo_cli.geometry.lens import undistort
 from projservo_cli.geometry.mechanisms import make_span, rows_of, workspace
+from projservo_cli.geometry.null_space import COORDINATES
 from projservo_cli.records import VIEWS, FloatArray, InputError, IntArray, Model, Plan, WorkFailed
-from projservo_cli.task.body import NO_BODY, SETTLED, Body, carry, fit_body
+from projservo_cli.task.body_pose import NO_BODY, SETTLED, Body, carry, fit_body
 from projservo_cli.task.face import (
     MISFIT_GOAL,
     MISFIT_START,

@@ -15,7 +15,7 @@ import pytest
 import projservo_cli as ps
 from projservo_cli import cli
 from projservo_cli.calibration import prediction_variance
-from projservo_cli.planning import shown_joints
+from projservo_cli.planning import joints_from_images
 from projservo_cli.records import Calibration, Observation, Trace, changed, flat_fields
 from projservo_cli.store.observation_tables import read_table, write_table
 from tests.configured import calibrate
@@ -142,7 +142,9 @@ def test_a_run_has_the_start_and_goal_of_its_plan(config, made):
 
 
 def test_goal_images_without_joints_must_fit_the_calibration(config, made, monkeypatch):
-    monkeypatch.setattr(shown_joints, "_TRIALS", 5)  # else seconds until images that fit nowhere are given up
+    monkeypatch.setattr(
+        joints_from_images, "_TRIALS", 5
+    )  # else seconds until images that fit nowhere are given up
     _, calibration, plan = made
     images = calibration.predict(plan.q_start + 0.1)[:, calibration.indices_of(config.face_numbers)]
     assert ps.plan(config, calibration, goal=images).feasible

@@ -15,7 +15,7 @@ from threadpoolctl import threadpool_limits
 import projservo_cli as ps
 from projservo_cli.config.inputs import servo_inputs
 from projservo_cli.laws import LAWS
-from projservo_cli.loop.compiled import run_compiled
+from projservo_cli.loop.compiled_loop import run_compiled
 from projservo_cli.stages import bench
 from tests.known import configured
 

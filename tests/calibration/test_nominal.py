@@ -8,7 +8,7 @@ import pytest
 
 from projservo_cli.calibration import Nominal, calibrate, predict
 from projservo_cli.records import InputError
-from projservo_cli.store.nominal import read_nominal as fields_of
+from projservo_cli.store.nominal_robot import read_nominal as fields_of
 from tests.calibration.simulated_robot import around, random_robot, trials
 
 SIGMA = 0.5

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from projservo_cli.store.files import working_in
+from projservo_cli.store.files_and_locks import working_in
 from projservo_cli.store.run_file import load, save
 
 ESCAPES = "\x1b[2J\x07\x9b31m\u202egnp.exe\u2028</script><img src=x onerror=alert(1)>"
@@ -91,7 +91,7 @@ def test_a_second_process_is_refused_and_nothing_is_lost(projservo, stages, tmp_
 def test_what_another_process_made_meanwhile_is_kept(projservo, stages, tmp_path, monkeypatch):
     """Between reading the run and having the folder for itself, another process made the plan."""
     projservo("calibrate", "-c", "tiny.yaml", "-o", "out")
-    from projservo_cli.store import files as lock
+    from projservo_cli.store import files_and_locks as lock
 
     waiting = lock.working_in
 

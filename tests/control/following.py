@@ -5,7 +5,7 @@ import pickle
 
 import numpy as np
 
-from projservo_cli.planning.margins import limits_alone
+from projservo_cli.planning.motion_margins import limits_alone
 from projservo_cli.records import JointLimits, no_lenses
 from projservo_cli.stages.plan import plan_task
 from projservo_cli.task.target import Goal, TaskImages, followed

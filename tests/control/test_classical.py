@@ -6,8 +6,8 @@ import pytest
 from projservo_cli.control.law import LOST, OK, new_state, reset
 from projservo_cli.geometry.kinematics import image_jacobian
 from projservo_cli.laws import CODES
-from projservo_cli.loop.python import BuiltInLaw
-from projservo_cli.task.body import make_body
+from projservo_cli.loop.python_loop import BuiltInLaw
+from projservo_cli.task.body_pose import make_body
 from tests.samples import frame, operators, poe
 from tests.scene import GAINS, scene
 

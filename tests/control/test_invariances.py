@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from projservo_cli.control.law import OK
 from projservo_cli.laws import CODES, LAW_SPECS
-from projservo_cli.loop.python import BuiltInLaw
+from projservo_cli.loop.python_loop import BuiltInLaw
 from projservo_cli.records import FloatArray, Model
 from projservo_cli.task.target import Goal, TaskImages
 from tests.samples import frame, in_frame

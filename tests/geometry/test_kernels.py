@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from projservo_cli.geometry.kernels import kernel_vector, least_squares, new_system
+from projservo_cli.geometry.null_space import kernel_vector, least_squares, new_system
 
 
 def system_of(A, b=0.0):

@@ -6,7 +6,7 @@ import numpy as np
 
 from projservo_cli.config import load_config
 from projservo_cli.config.inputs import recording_inputs
-from projservo_cli.config.whole import truth_of
+from projservo_cli.config.settings_and_rules import truth_of
 from projservo_cli.findings import Finding
 from projservo_cli.hardware import checks_in_motion
 from projservo_cli.robots.contract import PluginRobot, at_rest_after

@@ -18,10 +18,10 @@ from projservo_cli.config.inputs import calibration_inputs
 from projservo_cli.findings import NOTE, REFUSES, Finding, Subject, first
 from projservo_cli.hardware.checks_at_rest import RobotAtRest
 from projservo_cli.records import JointLimits, Observation
-from projservo_cli.report.live_page import LivePage
+from projservo_cli.report.image_pages import LivePage
 from projservo_cli.stages import calibrate
 from projservo_cli.stages.doctor import Checked, calibration_finding, mended_by_refit
-from projservo_cli.store.files import working_in
+from projservo_cli.store.files_and_locks import working_in
 from projservo_cli.store.run_file import load
 from projservo_cli.words import line
 from tests.conftest import ROOT

@@ -6,8 +6,8 @@ import numpy as np
 
 from projservo_cli.laws import IMAGE_TRACK, LAWS, REGULATE, TRACK, law_and_mode, run_names
 from projservo_cli.records import InputError, WorkFailed
-from projservo_cli.stages.motions import search_of
 from projservo_cli.stages.plan import plan_task
+from projservo_cli.stages.plan_motion import search_of
 from projservo_cli.stages.runs.law_run import LawRun
 from tests.configured import scenario_of
 from tests.known import asked

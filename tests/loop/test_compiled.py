@@ -9,7 +9,7 @@ from numba import typeof
 from projservo_cli.control import make_law
 from projservo_cli.control.law import ERRORS, Law, State, new_state, reset
 from projservo_cli.laws import CODES
-from projservo_cli.loop.compiled import Course, run_compiled
+from projservo_cli.loop.compiled_loop import Course, run_compiled
 from projservo_cli.loop.jit_warmup import calls
 from projservo_cli.loop.run_metrics import SUBSAMPLES, Ended, path_deviation, summarize
 from projservo_cli.loop.verdicts import CONVERGED, MAX_STEPS, Log, new_log

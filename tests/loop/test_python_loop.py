@@ -5,7 +5,7 @@ import pytest
 
 from projservo_cli.control.law import ERRORS, OK
 from projservo_cli.laws import CODES, LAW_SPECS
-from projservo_cli.loop.python import BuiltInLaw, run_in_python
+from projservo_cli.loop.python_loop import BuiltInLaw, run_in_python
 from projservo_cli.loop.verdicts import VERDICT_NAMES
 from projservo_cli.simulation.analytic_plant import AnalyticPlant
 from tests.control.following import tracked

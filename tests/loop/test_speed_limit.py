@@ -5,7 +5,7 @@ import pytest
 
 from projservo_cli.control.law import OK
 from projservo_cli.laws import CODES
-from projservo_cli.loop.python import BuiltInLaw, run_in_python
+from projservo_cli.loop.python_loop import BuiltInLaw, run_in_python
 from projservo_cli.simulation.analytic_plant import AnalyticPlant
 from projservo_cli.stages.runs.plugin_law import PluginLaw
 from tests.conftest import SHIPPED

@@ -6,7 +6,7 @@ from scipy.linalg import expm
 from scipy.stats import chi2
 
 import projservo_cli as projservo
-from projservo_cli.config.whole import truth_of
+from projservo_cli.config.settings_and_rules import truth_of
 from projservo_cli.metric.frame import Metric
 from projservo_cli.records import Calibration, InputError, WorkFailed, changed, composed, flat_fields
 from projservo_cli.results import ImageModel

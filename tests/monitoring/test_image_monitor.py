@@ -14,8 +14,8 @@ from projservo_cli.calibration.prediction import (
 )
 from projservo_cli.geometry.displacements import displacements
 from projservo_cli.monitoring import innovation_tests
-from projservo_cli.monitoring.accuracy import Posture
-from projservo_cli.monitoring.at_rest import fault_at_rest
+from projservo_cli.monitoring.arrival_accuracy import Posture
+from projservo_cli.monitoring.fault_at_rest import fault_at_rest
 from projservo_cli.monitoring.frame_pairs import FramePair
 from projservo_cli.monitoring.image_monitor import ImageMonitor
 from projservo_cli.monitoring.innovation_tests import WINDOW, Detector, ErrorModel

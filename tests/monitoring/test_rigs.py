@@ -9,8 +9,8 @@ from scipy.linalg import expm
 
 from projservo_cli.calibration import calibrate, prediction
 from projservo_cli.monitoring import innovation_tests
-from projservo_cli.monitoring.accuracy import Posture, resting_error_mm, rigid_fit
-from projservo_cli.monitoring.at_rest import fault_at_rest
+from projservo_cli.monitoring.arrival_accuracy import Posture, resting_error_mm, rigid_fit
+from projservo_cli.monitoring.fault_at_rest import fault_at_rest
 from projservo_cli.monitoring.frame_pairs import FramePair, Pairing, TimedImage
 from projservo_cli.monitoring.hypotheses import Evidence, causes_of
 from projservo_cli.monitoring.image_monitor import ImageMonitor

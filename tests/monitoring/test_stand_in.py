@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from projservo_cli.monitoring.at_rest import fault_at_rest
+from projservo_cli.monitoring.fault_at_rest import fault_at_rest
 from projservo_cli.records import Observation
 from tests.monitoring.stand_in import IMAGE, StandIn
 from tests.studies.monitoring import Rig, calibrated, driven, tasks

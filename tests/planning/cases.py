@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from projservo_cli.planning.margins import Reaching
+from projservo_cli.planning.motion_margins import Reaching
 from projservo_cli.stages.plan import plan_task
 from tests.known import asked
 from tests.stages.cases import case

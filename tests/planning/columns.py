@@ -1,11 +1,18 @@
 """First columns of the margins of joints before two views, by their kinds."""
 
-from projservo_cli.planning import margins
+from projservo_cli.planning import motion_margins
 
 JOINTS, FRONT, VISIBILITY, WIDTH, IMAGE, CLEAR, MARGINS = (
-    margins.column(kind, 2)
+    motion_margins.column(kind, 2)
     for kind in (
-        *(margins.JOINTS, margins.FRONT, margins.VISIBILITY, margins.WIDTH, margins.IMAGE, margins.CLEAR),
-        margins.CONDITIONING,
+        *(
+            motion_margins.JOINTS,
+            motion_margins.FRONT,
+            motion_margins.VISIBILITY,
+            motion_margins.WIDTH,
+            motion_margins.IMAGE,
+            motion_margins.CLEAR,
+        ),
+        motion_margins.CONDITIONING,
     )
 )

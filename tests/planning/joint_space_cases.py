@@ -5,9 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from projservo_cli.planning.constraints import Constraints, constraints_of
 from projservo_cli.planning.goal_configurations import GoalFeatures
-from projservo_cli.planning.margins import Demands
+from projservo_cli.planning.joint_constraints import Constraints, constraints_of
+from projservo_cli.planning.motion_margins import Demands
 from projservo_cli.simulation.random_tasks import random_tasks
 from projservo_cli.task.target import Goal, TaskImages
 from tests.configured import joints_of, truth_of

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
 from projservo_cli.geometry.stereo import optical_centers
-from projservo_cli.planning.constraints import new_trial, reached, width
+from projservo_cli.planning.joint_constraints import new_trial, reached, width
 from projservo_cli.planning.rrt_connect import margins_at, with_ends
 from projservo_cli.records import NO_SPREAD, Spread
 from tests.planning.columns import FRONT, IMAGE, JOINTS, VISIBILITY, WIDTH

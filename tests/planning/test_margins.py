@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from projservo_cli.image_size import BEHIND
-from projservo_cli.planning.constraints import constraints_of
-from projservo_cli.planning.margins import (
+from projservo_cli.planning.joint_constraints import constraints_of
+from projservo_cli.planning.motion_margins import (
     along_joints,
     along_shares,
     image_margin,

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from projservo_cli.calibration import calibrate, prediction_variance
-from projservo_cli.planning.model_spread import Region
 from projservo_cli.planning.pose_selection import suggest
+from projservo_cli.planning.prediction_covariance import Region
 from projservo_cli.records import WorkFailed, changed
 from tests.calibration.simulated_robot import IMAGE_SIZE, around, random_robot, trials
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from projservo_cli.planning.constraints import new_trial
+from projservo_cli.planning.joint_constraints import new_trial
 from projservo_cli.planning.rrt_connect import SearchLimits, find_path, margins_at
 from projservo_cli.planning.time_parameterization import ROOM, joints_at, time_parameterized
 from tests.planning.columns import JOINTS, VISIBILITY, WIDTH

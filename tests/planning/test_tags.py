@@ -5,11 +5,11 @@ import pytest
 from scipy.spatial import ConvexHull
 
 from projservo_cli.geometry.stereo import optical_centers
-from projservo_cli.planning.constraints import FINE_PX, constraints_of
+from projservo_cli.planning.joint_constraints import FINE_PX, constraints_of
 from projservo_cli.planning.rrt_connect import margins_at
 from projservo_cli.simulation.arm import METRIC_A_INF
-from projservo_cli.stages.motions import search_of
 from projservo_cli.stages.plan import plan_task
+from projservo_cli.stages.plan_motion import search_of
 from projservo_cli.stages.runs.run_trace import trace_of
 from projservo_cli.stages.servo import drive
 from tests.configured import calibrate, scenario_of

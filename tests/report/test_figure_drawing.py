@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from matplotlib.text import Text
 
-from projservo_cli.report import drawing, style
+from projservo_cli.report import figure_processes, style
 from tests.report.cases import SPECS, case, seen
 
 VIEWS = "left", "right", "ceiling"
@@ -49,7 +49,9 @@ def test_axes_have_units_and_no_text_is_clipped_by_the_figure_or_lies_on_another
 
 def test_two_processes_draw_the_same_bytes_as_one_even_where_the_second_ends(monkeypatch):
     formats = {"fig01_partition": ("svg",), "fig11_image_errors": ("svg",), "fig15_modes_path": style.FORMATS}
-    figures = [drawing.Drawing(SPECS[name], SPECS[name].data(case()[2]), of) for name, of in formats.items()]
+    figures = [
+        figure_processes.Drawing(SPECS[name], SPECS[name].data(case()[2]), of) for name, of in formats.items()
+    ]
     alone = [figure.contents() for figure in figures]
     here, contents = [], style.contents
 
@@ -60,11 +62,11 @@ def test_two_processes_draw_the_same_bytes_as_one_even_where_the_second_ends(mon
             assert second._changed.wait_for(lambda: second._drawn or not second._working, 60.0)
         return contents(*given)
 
-    monkeypatch.setattr(drawing, "PROCESSORS", 2)
+    monkeypatch.setattr(figure_processes, "PROCESSORS", 2)
     monkeypatch.setattr(style, "contents", drawn_here)
     for ended in (False, True):
         here.clear()
-        with drawing.SecondProcess() as second:
+        with figure_processes.SecondProcess() as second:
             if ended:
                 second._process.kill()
             assert list(second.contents(figures)) == alone

@@ -6,8 +6,8 @@ import numpy as np
 
 from projservo_cli.geometry.kinematics import forward_kinematics, project
 from projservo_cli.report.figures.joint_space import PIECES
-from projservo_cli.stages.motions import JointSearch
 from projservo_cli.stages.plan import plan_task
+from projservo_cli.stages.plan_motion import JointSearch
 from tests.known import asked
 from tests.report.cases import SPECS, case
 

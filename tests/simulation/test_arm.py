@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from projservo_cli.simulation.arm import roll_axis
-from projservo_cli.simulation.workspace import turned
+from projservo_cli.simulation.ground_truth import turned
 from tests.configured import truth_of
 from tests.known import configured
 from tests.samples import displacement

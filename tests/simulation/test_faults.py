@@ -9,7 +9,7 @@ from projservo_cli.config import Config
 from projservo_cli.records import no_lenses, position_limits
 from projservo_cli.simulation.arm import SerialArm
 from projservo_cli.simulation.faults import FaultyRobot, Points, World, full_reach
-from projservo_cli.simulation.workspace import Truth
+from projservo_cli.simulation.ground_truth import Truth
 from tests.samples import displacement, pixels, revolute, rig
 
 PERIOD = 0.04

@@ -13,7 +13,7 @@ from scipy.linalg import expm
 from projservo_cli.control.law import Gains
 from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.laws import CODES
-from projservo_cli.loop.python import BuiltInLaw, run_in_python
+from projservo_cli.loop.python_loop import BuiltInLaw, run_in_python
 from projservo_cli.loop.verdicts import VERDICT_NAMES, Limits
 from projservo_cli.records import Model, no_lenses, position_limits
 from projservo_cli.simulation.analytic_plant import AnalyticPlant, Plant

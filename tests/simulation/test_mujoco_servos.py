@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from projservo_cli.config import load_config
-from projservo_cli.simulation.physics import Physics
+from projservo_cli.simulation.mujoco_servos import Physics
 from tests.configured import truth_of
 from tests.simulation.conftest import eyes_of
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import kstest, t
 
-from projservo_cli.simulation.streams import NORMAL, NoiseShape, generator
+from projservo_cli.simulation.random_streams import NORMAL, NoiseShape, generator
 
 
 @pytest.mark.parametrize("shape", [NORMAL, NoiseShape(3.0), NoiseShape(5.0, 0.05, 20.0)])

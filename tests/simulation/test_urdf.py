@@ -8,7 +8,7 @@ import pytest
 from projservo_cli.config import load_config
 from projservo_cli.records import InputError
 from projservo_cli.simulation import mjcf
-from projservo_cli.simulation.described import arm_of
+from projservo_cli.simulation.from_settings import arm_of
 from tests.samples import displacement
 
 try:

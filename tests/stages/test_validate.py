@@ -5,7 +5,7 @@ import pytest
 
 from projservo_cli.calibration import calibrate, predict
 from projservo_cli.findings import LIMITS, REFUSES
-from projservo_cli.monitoring.at_rest import fault_at_rest
+from projservo_cli.monitoring.fault_at_rest import fault_at_rest
 from projservo_cli.records import Observation
 from projservo_cli.stages.validate import compared
 from tests.calibration.simulated_robot import around, random_robot, trials

@@ -6,7 +6,7 @@ from dataclasses import fields, is_dataclass
 import pytest
 
 from projservo_cli.config import inputs as given
-from projservo_cli.simulation.workspace import Truth
+from projservo_cli.simulation.ground_truth import Truth
 from projservo_cli.stages.scenario import world_of
 from projservo_cli.stages.worlds.calibrated import CalibratedWorld
 from projservo_cli.stages.worlds.simulated import RenderedWorld, SimulatedWorld

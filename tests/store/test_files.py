@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from projservo_cli.records import InputError
-from projservo_cli.store.files import lies_inside, require_inside, working_in
+from projservo_cli.store.files_and_locks import lies_inside, require_inside, working_in
 from projservo_cli.store.observation_tables import write_table
 from projservo_cli.store.run_file import save
 from tests.configured import compared
@@ -21,7 +21,7 @@ unix = pytest.mark.skipif(sys.platform == "win32", reason="processes and links a
 HOLD = """
 import sys
 from pathlib import Path
-from projservo_cli.store.files import replacing, working_in
+from projservo_cli.store.files_and_locks import replacing, working_in
 with {what}(Path(sys.argv[1])) as path:
     print(path, flush=True)
     sys.stdin.read()

@@ -15,14 +15,14 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 import projservo_cli as projservo
-from projservo_cli.config.whole import truth_of
+from projservo_cli.config.settings_and_rules import truth_of
 from projservo_cli.geometry.kinematics import project
 from projservo_cli.image_size import within_images
 from projservo_cli.records import WorkFailed
 from projservo_cli.simulation.arm import camera_center
 from projservo_cli.simulation.random_tasks import random_tasks
 from projservo_cli.task.displaced_object import DisplacedObject
-from projservo_cli.task.look_bundle import Look
+from projservo_cli.task.object_bundle_adjustment import Look
 from tests.known import configured
 from tests.studies.common import in_two_processes, parser_of, quantiles, rate, written
 from tests.studies.hand_eye_coverage import pose

@@ -12,9 +12,9 @@ import numpy as np
 from scipy.stats import binomtest
 from tqdm import tqdm
 
-from projservo_cli.planning.constraints import constraints_of
 from projservo_cli.planning.goal_configurations import GoalFeatures
-from projservo_cli.planning.margins import limits_alone
+from projservo_cli.planning.joint_constraints import constraints_of
+from projservo_cli.planning.motion_margins import limits_alone
 from projservo_cli.planning.rrt_connect import SearchLimits, find_path
 from projservo_cli.simulation.random_tasks import random_tasks
 from projservo_cli.task.target import Goal, TaskImages

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.stats import chi2
 
 import projservo_cli as projservo
-from projservo_cli.config.whole import truth_of
+from projservo_cli.config.settings_and_rules import truth_of
 from projservo_cli.metric.frame import Metric
 from projservo_cli.metric.nominal_comparison import in_model_frames
 from projservo_cli.records import WorkFailed, changed

@@ -41,8 +41,8 @@ MODULES = (
         "task/partition",
         "task/target",
     ),
-    *("control/direct", "control/law", "planning/margins", "planning/constraints"),
-    *("calibration/bundle_adjustment", "calibration/triangulation", "calibration/epipolar"),
+    *("control/direct", "control/law", "planning/motion_margins", "planning/joint_constraints"),
+    *("calibration/bundle_adjustment", "calibration/initial/triangulation", "calibration/initial/epipolar"),
     "monitoring/innovation_tests",
 )
 BINARY = ("Add_Sub", "Sub_Add", "Mul_Div", "Div_Mul", "Pow_Mul")

@@ -30,7 +30,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from projservo_cli.config import load_config, shipped
-from projservo_cli.config.whole import truth_of
+from projservo_cli.config.settings_and_rules import truth_of
 from projservo_cli.geometry.displacements import rigid
 from projservo_cli.records import InputError
 from projservo_cli.robots.session import Session

@@ -17,16 +17,16 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from projservo_cli.geometry.stereo import optical_centers
-from projservo_cli.planning.constraints import constraints_of
 from projservo_cli.planning.goal_configurations import GoalFeatures
+from projservo_cli.planning.joint_constraints import constraints_of
 from projservo_cli.planning.keep_out import keep_out_of
-from projservo_cli.planning.margins import limits_alone
+from projservo_cli.planning.motion_margins import limits_alone
 from projservo_cli.planning.rrt_connect import SearchLimits, find_path, within_region
 from projservo_cli.records import WorkFailed
 from projservo_cli.settings.task import KeptOut
 from projservo_cli.simulation.arm import METRIC_A_INF
+from projservo_cli.simulation.ground_truth import Truth
 from projservo_cli.simulation.random_tasks import random_tasks
-from projservo_cli.simulation.workspace import Truth
 from projservo_cli.stages.runs.run_trace import trace_of
 from projservo_cli.stages.servo import drive
 from projservo_cli.stages.worlds.simulated import SimulatedWorld

@@ -15,7 +15,7 @@ from itertools import count
 import numpy as np
 from tqdm import tqdm
 
-from projservo_cli.planning.constraints import demands_into
+from projservo_cli.planning.joint_constraints import demands_into
 from projservo_cli.planning.rrt_connect import SearchLimits, find_path, margins_at, with_ends
 from projservo_cli.planning.time_parameterization import minimum_time
 from tests.studies.common import asked_for, quantiles, task_configs, true_search, write_rows

@@ -18,7 +18,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from projservo_cli.cli import run
-from projservo_cli.config.whole import truth_of
+from projservo_cli.config.settings_and_rules import truth_of
 from tests.studies.common import quantiles
 from tests.studies.so101_tutorial import SHORTER, START, benched, by_hand, configure, through_all
 

@@ -4,7 +4,7 @@ import signal
 import sys
 import time
 
-from projservo_cli.sweeps.engine import Engine
+from projservo_cli.sweeps.workers import Engine
 
 
 def send_a_part(_):

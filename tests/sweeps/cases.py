@@ -3,8 +3,8 @@
 from projservo_cli.config.sweep import SweepConfig
 from projservo_cli.store.sweep_table import SweepTable
 from projservo_cli.sweeps.design import read_design
-from projservo_cli.sweeps.engine import Engine
 from projservo_cli.sweeps.folder import Folder, run_sweep
+from projservo_cli.sweeps.workers import Engine
 from tests.conftest import ROOT
 
 QUICK = {"stop.max_steps": 60, "noise.servo_px": 0.3, "calibration.frames_per_joint": 6}

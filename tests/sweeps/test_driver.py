@@ -8,9 +8,9 @@ import pytest
 
 from projservo_cli.records import InputError, WorkFailed
 from projservo_cli.store.sweep_table import SweepTable
-from projservo_cli.sweeps import engine
-from projservo_cli.sweeps.engine import Engine
+from projservo_cli.sweeps import workers
 from projservo_cli.sweeps.folder import Folder
+from projservo_cli.sweeps.workers import Engine
 from tests.sweeps import dying, processes
 from tests.sweeps.cases import columns, design, make
 
@@ -119,6 +119,6 @@ def test_jobs_of_a_lost_process_are_made_again_until_processes_die_again_and_aga
     jobs = [(number, tmp_path / "died") for number in range(12)]
     assert sorted(Engine(2).completed(dying.once, jobs)) == list(range(12))
     assert (tmp_path / "died").exists()
-    monkeypatch.setattr(engine, "MOST_LOSSES", 1)
+    monkeypatch.setattr(workers, "MOST_LOSSES", 1)
     with pytest.raises(WorkFailed, match="lost 2 times in a row"):
         list(Engine(2).completed(dying.always, [1]))

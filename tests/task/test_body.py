@@ -7,8 +7,8 @@ import pytest
 from scipy.linalg import expm
 
 from projservo_cli.geometry.algebra import as_array, mat
-from projservo_cli.geometry.kernels import COORDINATES
-from projservo_cli.task.body import ALL_VIEWS, SETTLED, fit_body, make_body
+from projservo_cli.geometry.null_space import COORDINATES
+from projservo_cli.task.body_pose import ALL_VIEWS, SETTLED, fit_body, make_body
 from tests.samples import arm, displacement, frame, in_frame, pixels, poe, revolute
 
 FRAMES = [None, 1, 2]

@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from projservo_cli.geometry.displacements import generators
 from projservo_cli.metric.frame import changes_of
-from projservo_cli.monitoring.accuracy import metres_by
+from projservo_cli.monitoring.arrival_accuracy import metres_by
 from projservo_cli.records import ANGLE, MEET, PARALLEL, PERPENDICULAR
 from projservo_cli.task.incidence_errors import (
     Separation,
@@ -17,7 +17,7 @@ from projservo_cli.task.incidence_errors import (
     placed_by,
 )
 from projservo_cli.task.incidences import Incidence
-from projservo_cli.task.look_bundle import BundleFit, Look
+from projservo_cli.task.object_bundle_adjustment import BundleFit, Look
 from tests.configured import calibrate, truth_of
 from tests.known import configured
 

@@ -20,9 +20,9 @@ from projservo_cli.records import (
     WorkFailed,
     position_limits,
 )
-from projservo_cli.task.body import SETTLED, fit_body, make_body
-from projservo_cli.task.contradictions import contradictions
+from projservo_cli.task.body_pose import SETTLED, fit_body, make_body
 from projservo_cli.task.face import MIDPOINT, center_of, cyclic_order, face_plane
+from projservo_cli.task.incidence_contradictions import contradictions
 from projservo_cli.task.incidence_errors import angle_off
 from projservo_cli.task.incidences import (
     Incidence,

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from projservo_cli.geometry.kinematics import project
-from projservo_cli.monitoring.accuracy import metres_a_unit
+from projservo_cli.monitoring.arrival_accuracy import metres_a_unit
 from projservo_cli.records import InputError, WorkFailed
-from projservo_cli.task.body import make_body
+from projservo_cli.task.body_pose import make_body
 from projservo_cli.task.stand_off import StandOff, displacement_back
 from tests.samples import frame, in_frame, poe
 from tests.task.test_incidences import deviating, random_arm

@@ -7,7 +7,7 @@ import pytest
 
 from projservo_cli.geometry.algebra import as_array, mat
 from projservo_cli.records import WorkFailed
-from projservo_cli.task.body import SETTLED, fit_body, make_body
+from projservo_cli.task.body_pose import SETTLED, fit_body, make_body
 from projservo_cli.task.face import UNSEEN_GOAL, require_found
 from projservo_cli.task.target import Goal, TaskImages
 from tests.samples import frame, pixels, poe

@@ -16,8 +16,8 @@ from projservo_cli.control.law import ERRORS, MAX_PARTS
 from projservo_cli.findings import Finding
 from projservo_cli.geometry.mechanisms import in_span
 from projservo_cli.laws import CODES, INCIDENCES, REGULATE
-from projservo_cli.loop.compiled import Course, run_compiled
-from projservo_cli.loop.python import BuiltInLaw, LoopLaw, run_in_python
+from projservo_cli.loop.compiled_loop import Course, run_compiled
+from projservo_cli.loop.python_loop import BuiltInLaw, LoopLaw, run_in_python
 from projservo_cli.loop.replanning import ExecutionMonitor
 from projservo_cli.loop.run_metrics import Ended, Summary, path_deviation, summarize
 from projservo_cli.loop.stall_monitor import StallMonitor
@@ -40,7 +40,7 @@ from projservo_cli.results import ImageModel
 from projservo_cli.robots.latency_compensation import DrivenRobot
 from projservo_cli.robots.session import Session
 from projservo_cli.simulation.analytic_plant import AnalyticPlant, Ends, Plant
-from projservo_cli.stages.motions import PathReplanner, search_of, why_closed
+from projservo_cli.stages.plan_motion import PathReplanner, search_of, why_closed
 from projservo_cli.stages.runs.plugin_law import LawSetup, PluginLaw
 from projservo_cli.stages.runs.robot_with_monitors import connected_robot
 from projservo_cli.stages.scenario import RunScenario

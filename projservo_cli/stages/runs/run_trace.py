@@ -10,9 +10,9 @@ import numpy as np
 from projservo_cli.control.law import TAU_AFFINE, THETA_S
 from projservo_cli.findings import LIMITS, NOTE, REFUSES, Finding, Subject
 from projservo_cli.geometry.algebra import as_array
-from projservo_cli.geometry.kernels import COORDINATES
 from projservo_cli.geometry.kinematics import forward, image_jacobian, joint_operators
 from projservo_cli.geometry.lens import undistort
+from projservo_cli.geometry.null_space import COORDINATES
 from projservo_cli.laws import REGULATE
 from projservo_cli.loop.verdicts import (
     PLATEAU_FALL,
@@ -20,7 +20,7 @@ from projservo_cli.loop.verdicts import (
     plateau_stretch,
     tolerance,
 )
-from projservo_cli.monitoring.accuracy import Posture, rigid_fit
+from projservo_cli.monitoring.arrival_accuracy import Posture, rigid_fit
 from projservo_cli.monitoring.innovation_tests import WINDOW
 from projservo_cli.records import (
     BoolArray,
@@ -39,7 +39,7 @@ from projservo_cli.simulation.analytic_plant import rig_distance
 from projservo_cli.simulation.faults import obstruction_of
 from projservo_cli.stages.carried_goals import markers_now
 from projservo_cli.stages.runs.law_run import LawRun
-from projservo_cli.task.body import SETTLED, fit_body
+from projservo_cli.task.body_pose import SETTLED, fit_body
 from projservo_cli.task.face import Task
 from projservo_cli.task.incidence_errors import IncidenceErrors, TaughtAndNow, incidence_errors
 from projservo_cli.task.incidences import (
@@ -48,7 +48,7 @@ from projservo_cli.task.incidences import (
     images_of,
     points_of,
 )
-from projservo_cli.task.look_bundle import NO_POINTS, Look
+from projservo_cli.task.object_bundle_adjustment import NO_POINTS, Look
 from projservo_cli.task.target import TaskImages
 from projservo_cli.words import text
 from projservo_cli.words.reasons import VERDICTS, arrived

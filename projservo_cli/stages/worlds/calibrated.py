@@ -32,12 +32,12 @@ from projservo_cli.robots.session import Session
 from projservo_cli.robots.standstill import STILL, seen_at_rest
 from projservo_cli.settings.task import GoalImages, TaskSettings
 from projservo_cli.simulation.analytic_plant import Ends, Plant
-from projservo_cli.simulation.workspace import turned
+from projservo_cli.simulation.ground_truth import turned
 from projservo_cli.stages.stage_inputs import CarryingObject, Contract, PlanInputs
 from projservo_cli.stages.worlds.external_robot import opened_robot, path_to
 from projservo_cli.stages.worlds.task_images import given_pixels, task_images
-from projservo_cli.task.body import NO_BODY, Body, make_body
-from projservo_cli.task.look_bundle import Look
+from projservo_cli.task.body_pose import NO_BODY, Body, make_body
+from projservo_cli.task.object_bundle_adjustment import Look
 from projservo_cli.task.target import TaskImages, is_stereo
 from projservo_cli.words import failed, order_advice, sentence
 from projservo_cli.words.table import Setup

@@ -9,10 +9,10 @@ import numpy as np
 from projservo_cli.calibration.prediction import predict
 from projservo_cli.findings import Finding
 from projservo_cli.geometry.algebra import mat
-from projservo_cli.geometry.kernels import COORDINATES
+from projservo_cli.geometry.null_space import COORDINATES
 from projservo_cli.loop.run_metrics import Summary
-from projservo_cli.monitoring.accuracy import metres_a_unit
-from projservo_cli.planning.shown_joints import NEAR_PX, joints_showing
+from projservo_cli.monitoring.arrival_accuracy import metres_a_unit
+from projservo_cli.planning.joints_from_images import NEAR_PX, joints_showing
 from projservo_cli.records import (
     CORNERS,
     FloatArray,
@@ -27,8 +27,8 @@ from projservo_cli.robots.session import Session
 from projservo_cli.settings.task import TaskSettings
 from projservo_cli.simulation.analytic_plant import NO_PINS, Ends, Plant, observe
 from projservo_cli.simulation.faults import FaultyRobot, Points, SimulatedRobot, observed_in_frames, robot_of
-from projservo_cli.simulation.rendering import RenderedScene
-from projservo_cli.simulation.streams import (
+from projservo_cli.simulation.ground_truth import SceneObject, Truth, plant_of, turned
+from projservo_cli.simulation.random_streams import (
     GOAL_FRAMES,
     OBJECT_NOW,
     OBJECT_TAUGHT,
@@ -39,15 +39,15 @@ from projservo_cli.simulation.streams import (
     TARGET_NOISE,
     generator,
 )
-from projservo_cli.simulation.workspace import SceneObject, Truth, plant_of, turned
+from projservo_cli.simulation.rendering import RenderedScene
 from projservo_cli.stages.stage_inputs import CarryingObject, Contract
 from projservo_cli.stages.worlds.calibrated import CalibratedWorld, TruePoses
 from projservo_cli.stages.worlds.external_robot import simulated_robot
 from projservo_cli.stages.worlds.task_images import positioned, task_images
-from projservo_cli.task.body import make_body
+from projservo_cli.task.body_pose import make_body
 from projservo_cli.task.face import center_of
 from projservo_cli.task.incidences import incidences_of, nearest_goal, points_of
-from projservo_cli.task.look_bundle import Look
+from projservo_cli.task.object_bundle_adjustment import Look
 from projservo_cli.task.stand_off import displacement_back
 from projservo_cli.task.target import TaskImages
 from projservo_cli.words import sentence

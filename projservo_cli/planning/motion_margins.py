@@ -1,7 +1,7 @@
 """Constraints of a planned motion, by name and in words, and the margins of a motion along shares or joints.
 
-Each margin is a number, positive where its constraint holds. Of joints (n,), as ``planning.constraints``
-writes them, less the error of a prediction:
+Each margin is a number, positive where its constraint holds. Of joints (n,), as
+``planning.joint_constraints`` writes them, less the error of a prediction:
 
 - joints: the minimum distance of a joint from its limits over the required margin;
 - front: the minimum third coordinate of P·M of a marker over that at the start: [RH00] section 4.2 carries
@@ -31,7 +31,6 @@ import numpy as np
 
 from projservo_cli.geometry.algebra import Mat4, Vec4, apply, mat, mat_into, meet, mul, vec
 from projservo_cli.geometry.jit import inline, internal, merged, njit, separate
-from projservo_cli.geometry.kernels import COORDINATES, orthogonalize, row_into
 from projservo_cli.geometry.kinematics import (
     backward,
     image_velocity,
@@ -50,6 +49,7 @@ from projservo_cli.geometry.mechanisms import (
     rows_of,
     workspace,
 )
+from projservo_cli.geometry.null_space import COORDINATES, orthogonalize, row_into
 from projservo_cli.image_size import BEHIND, border_distance
 from projservo_cli.records import VIEWS, FloatArray, IntArray, JointLimits, Model
 from projservo_cli.task.trajectory import displaced

@@ -9,10 +9,10 @@ from projservo_cli.findings import REFUSES, Finding, Subject, usable
 from projservo_cli.geometry.algebra import as_array
 from projservo_cli.geometry.kinematics import forward, forward_kinematics, project
 from projservo_cli.geometry.lens import undistort
-from projservo_cli.planning.constraints import Constraints, constraints_of
 from projservo_cli.planning.goal_configurations import GoalFeatures
+from projservo_cli.planning.joint_constraints import Constraints, constraints_of
 from projservo_cli.planning.keep_out import keep_out_of
-from projservo_cli.planning.margins import (
+from projservo_cli.planning.motion_margins import (
     CLEAR,
     IMAGE,
     Demands,
@@ -23,7 +23,7 @@ from projservo_cli.planning.margins import (
     column,
     columns,
 )
-from projservo_cli.planning.model_spread import spread_of
+from projservo_cli.planning.prediction_covariance import spread_of
 from projservo_cli.planning.product_space import duration, evenly, plan_path
 from projservo_cli.planning.rrt_connect import (
     JointPath,
@@ -38,7 +38,7 @@ from projservo_cli.records import NO_SPREAD, FloatArray, Model, Plan, Spread, Wo
 from projservo_cli.settings.task import Trajectory
 from projservo_cli.stages.plan_summary import sight_of, verdict_of
 from projservo_cli.stages.scenario import Scenario
-from projservo_cli.task.body import SETTLED, fit_body
+from projservo_cli.task.body_pose import SETTLED, fit_body
 from projservo_cli.task.face import Task
 from projservo_cli.task.target import TaskImages
 from projservo_cli.task.trajectory import profile_shares

@@ -8,7 +8,7 @@ import numpy as np
 
 from projservo_cli.findings import LIMITS, REFUSES, Finding, Subject
 from projservo_cli.records import BoolArray, FloatArray, Model
-from projservo_cli.task.body import Body
+from projservo_cli.task.body_pose import Body
 from projservo_cli.task.incidences import (
     Incidence,
     Incidences,

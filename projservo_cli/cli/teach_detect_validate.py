@@ -65,7 +65,7 @@ def _teach(
     from projservo_cli.records import InputError, WorkFailed
     from projservo_cli.settings.sections import JointVector
     from projservo_cli.stages import teach as stage
-    from projservo_cli.store.files import write_whole, writing
+    from projservo_cli.store.files_and_locks import write_whole, writing
     from projservo_cli.words import line
     from projservo_cli.words.table import Setup
     from projservo_cli.words.values import sharing

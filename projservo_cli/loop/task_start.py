@@ -11,11 +11,11 @@ from projservo_cli.geometry.jit import inline
 from projservo_cli.geometry.kinematics import backward
 from projservo_cli.geometry.mechanisms import OWN, Span, make_span
 from projservo_cli.laws import CODES
-from projservo_cli.loop.compiled import Course, run_compiled
+from projservo_cli.loop.compiled_loop import Course, run_compiled
 from projservo_cli.loop.verdicts import CONVERGED, Limits, new_log
 from projservo_cli.records import FloatArray, JointLimits, Model
 from projservo_cli.simulation.analytic_plant import Plant
-from projservo_cli.task.body import NO_BODY
+from projservo_cli.task.body_pose import NO_BODY
 from projservo_cli.task.face import FOUND, MIDPOINT, NOT_MEASURED, NOT_UNIQUE, Task, center_of, require_found
 from projservo_cli.task.partition import NO_PARTS, Parts, partition
 

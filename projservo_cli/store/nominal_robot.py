@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from projservo_cli.geometry.displacements import twists
 from projservo_cli.records import FloatArray, InputError
 from projservo_cli.settings.sections import Matrix34, Matrix44, Vector3, not_a_screw, not_rigid
-from projservo_cli.store.files import text_of
+from projservo_cli.store.files_and_locks import text_of
 
 _MAX_BYTES = 10_000_000  # of the file
 

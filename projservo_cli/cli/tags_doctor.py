@@ -77,7 +77,7 @@ def _tags(
     from projservo_cli.detection import TagFinder
     from projservo_cli.hardware import tag_sheets as sheets
     from projservo_cli.settings.markers import GROUND, Markers
-    from projservo_cli.store.files import write_whole
+    from projservo_cli.store.files_and_locks import write_whole
 
     if numbers is not None and kind != "single":
         raise click.UsageError(
@@ -147,9 +147,9 @@ def doctor(
     options : sets, move and watch of ``doctor``.
     """
     from projservo_cli.config.inputs import preflight_inputs
-    from projservo_cli.report.live_page import preflight_page
+    from projservo_cli.report.image_pages import preflight_page
     from projservo_cli.stages.doctor import check
-    from projservo_cli.store.files import write_whole, writing
+    from projservo_cli.store.files_and_locks import write_whole, writing
 
     settings = option.configured(config, options, teaching=True)
     stored = option.calibrated_run(run, settings)
@@ -180,7 +180,7 @@ def doctor(
 
 def _refit(checked: "Checked", stored: "Run | None", config: str, output: Path) -> dict[str, Any] | None:
     """Write the poses from which a camera that moved is fitted again; their file and the commands."""
-    from projservo_cli.store.files import write_whole
+    from projservo_cli.store.files_and_locks import write_whole
     from projservo_cli.store.observation_tables import to_csv
 
     if checked.refit is None or stored is None:
@@ -198,7 +198,7 @@ def _refit(checked: "Checked", stored: "Run | None", config: str, output: Path) 
 
 def _note_refuted(path: Path, refuted: str) -> None:
     """Store what contradicts the recording of a run, empty for nothing, if that has changed."""
-    from projservo_cli.store.files import working_in
+    from projservo_cli.store.files_and_locks import working_in
     from projservo_cli.store.run_file import load, save
 
     with working_in(path.parent):
@@ -235,7 +235,7 @@ def _goal_pixels(settings: "Config", view: Sequence[str]) -> "list[FloatArray]":
 
 
 def _pictures(settings: "Config", seen: "RobotAtRest") -> dict[str, bytes]:
-    from projservo_cli.report.live_page import annotated
+    from projservo_cli.report.image_pages import annotated
 
     names = [camera.name for camera in seen.cameras]
     each = zip(names, seen.views, seen.s, _goal_pixels(settings, names), strict=False)
@@ -246,7 +246,7 @@ def _watch(console: Console, settings: "Config", robot: "PluginRobot") -> None:
     """Serve the images until Ctrl-C."""
     import time
 
-    from projservo_cli.report.live_page import LivePage, annotated
+    from projservo_cli.report.image_pages import LivePage, annotated
 
     live, goals = LivePage(settings.name, robot.view), _goal_pixels(settings, robot.view)
     assert settings.markers is not None

@@ -42,7 +42,7 @@ from projservo_cli.simulation.arm import (
     inverse_kinematics,
     roll_axis,
 )
-from projservo_cli.simulation.streams import NORMAL, NoiseShape
+from projservo_cli.simulation.random_streams import NORMAL, NoiseShape
 from projservo_cli.task.face import center_of, cyclic_order, face_plane
 
 _EDGE_OF_FACE = 1e-9  # of a·O, from where a face is seen edge-on

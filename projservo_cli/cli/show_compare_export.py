@@ -171,7 +171,7 @@ def _export(
         value = {"run": found.path.resolve(), "files": [file.resolve() for file in files]}
         console.report(value, [f"export: {len(files)} files: {folder}"])
         return
-    from projservo_cli.store.files import write_whole
+    from projservo_cli.store.files_and_locks import write_whole
 
     if frames == "model" and nominal is None:
         raise click.UsageError("--frames model needs the model: --nominal URDF")
@@ -266,7 +266,7 @@ def _write_tables(run: Any, folder: Path) -> Iterator[Path]:
 
     from projservo_cli.findings import sparse
     from projservo_cli.records import flat_fields
-    from projservo_cli.store.files import write_whole
+    from projservo_cli.store.files_and_locks import write_whole
     from projservo_cli.store.observation_tables import to_csv
     from projservo_cli.store.run_file import further_parts
 

@@ -6,9 +6,9 @@ sight and within limits come first, and among them the near ones with margins.
 
 import numpy as np
 
-from projservo_cli.geometry.kernels import COORDINATES
 from projservo_cli.geometry.kinematics import forward_kinematics, image_jacobian, joint_operators
-from projservo_cli.planning.constraints import Constraints, time_between
+from projservo_cli.geometry.null_space import COORDINATES
+from projservo_cli.planning.joint_constraints import Constraints, time_between
 from projservo_cli.planning.rrt_connect import margins_at
 from projservo_cli.records import FloatArray, Model
 from projservo_cli.task.incidences import Incidences, image_error_at, linearized

@@ -1,7 +1,7 @@
 """Constraints as signed numbers: joint limits, visibility, image borders, from the calibrated model alone.
 
-The margins are those of ``planning.margins``. Of a tool with several tags visibility, width and image are
-those of the tag that keeps them best.
+The margins are those of ``planning.motion_margins``. Of a tool with several tags visibility, width and image
+are those of the tag that keeps them best.
 
 Joints are valid if each margin is above the required one, which is at most a fraction of those of start
 and goal have themselves, rising to its full value within ``_RISE`` of them.
@@ -14,7 +14,6 @@ import numpy as np
 
 from projservo_cli.geometry.algebra import Mat4, Vec4, apply, axpy, dot, sub, vec
 from projservo_cli.geometry.jit import internal, merged, njit
-from projservo_cli.geometry.kernels import row_into
 from projservo_cli.geometry.kinematics import (
     backward,
     forward,
@@ -23,8 +22,9 @@ from projservo_cli.geometry.kinematics import (
     limit_distance,
     row,
 )
+from projservo_cli.geometry.null_space import row_into
 from projservo_cli.planning.keep_out import NO_KEEP_OUT, SEVERAL, KeepOut, clearance, draws, squared
-from projservo_cli.planning.margins import (
+from projservo_cli.planning.motion_margins import (
     CLEAR,
     CONDITIONING,
     FRONT,
@@ -71,7 +71,7 @@ class Constraints(NamedTuple):
     image_size: FloatArray  # (V, 2) px, of each; infinite where an image has no border
     least_views: int  # number of views that are to see the face, the best ones
     keep: FloatArray  # (n,) distance from a limit that counts as margin one, rad or m
-    full: FloatArray  # (c,) margins asked for, in the columns of ``planning.margins``
+    full: FloatArray  # (c,) margins asked for, in the columns of ``planning.motion_margins``
     ends: FloatArray  # (k, n) start and goals, near which constraints are relaxed
     end_demands: FloatArray  # (k, c) required margins there
     spread: Spread = NO_SPREAD

@@ -18,9 +18,9 @@ from projservo_cli.settings.control import RenderedOptions
 from projservo_cli.settings.markers import Markers, Tag
 from projservo_cli.settings.robot import Camera, Rig, RobotSettings
 from projservo_cli.simulation.arm import Link, SerialArm, dh_twists
+from projservo_cli.simulation.ground_truth import Truth
+from projservo_cli.simulation.random_streams import NoiseShape
 from projservo_cli.simulation.rendering import RenderedScene, lens_of
-from projservo_cli.simulation.streams import NoiseShape
-from projservo_cli.simulation.workspace import Truth
 from projservo_cli.task.face import MIDPOINT
 
 

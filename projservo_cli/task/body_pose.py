@@ -25,7 +25,7 @@ from projservo_cli.geometry.algebra import (
 )
 from projservo_cli.geometry.displacements import invariant_rotations, twist_exponential
 from projservo_cli.geometry.jit import inline, internal, merged, njit, separate
-from projservo_cli.geometry.kernels import COORDINATES, solve_normal
+from projservo_cli.geometry.null_space import COORDINATES, solve_normal
 from projservo_cli.records import BoolArray, FloatArray, Model
 
 _Vec3 = tuple[float, float, float]

@@ -34,7 +34,7 @@ def _init(console: Console, *, file: Path, arm: str | None, force: bool) -> None
     editors complete and check it.
     """
     from projservo_cli.config.schema import as_text, json_schema, starter
-    from projservo_cli.store.files import write_whole
+    from projservo_cli.store.files_and_locks import write_whole
 
     path = file / _STARTER if file.is_dir() else file
     if path.suffix not in (".yaml", ".yml"):
@@ -63,7 +63,7 @@ def _schema(console: Console, *, what: str | None, output: Path | None) -> None:
     yaml-language-server: $schema=FILE. That of sweeps is projservo schema sweep.
     """
     from projservo_cli.config.schema import as_text, json_schema, sweep_schema
-    from projservo_cli.store.files import write_whole
+    from projservo_cli.store.files_and_locks import write_whole
 
     schema = sweep_schema() if what else json_schema()
     if output is None:
@@ -103,7 +103,7 @@ def _doctor(
     hysteresis, sag, and whether tags sit fast. Exit code 1 where a recording would fail.
     """
     if config is not None:
-        from projservo_cli.cli.hardware import doctor
+        from projservo_cli.cli.tags_doctor import doctor
 
         options = {"sets": sets, "move": move, "watch": watch}
         return doctor(console, run, config, options, output or Path("preflight.html"))

@@ -12,12 +12,12 @@ from projservo_cli import plugins
 from projservo_cli.chain.outdated import STAGES, Step, inputs_of, key_of_calibration, result_of, steps_for
 from projservo_cli.chain.progress import Listener
 from projservo_cli.chain.recordings import recording_made
-from projservo_cli.chain.sequences import Steps
+from projservo_cli.chain.task_steps import Steps
 from projservo_cli.config import Config, load_config, stored_yaml
 from projservo_cli.config.inputs import about_of, scenery_of, suggestion_inputs
 from projservo_cli.findings import Finding
 from projservo_cli.laws import CODES, POINT_LAWS, codes_of, law_and_mode, must_converge, run_name
-from projservo_cli.loop.compilation import compilation
+from projservo_cli.loop.jit_notice import compilation
 from projservo_cli.records import InputError, Plan, WorkFailed
 from projservo_cli.result_hashes import digest
 from projservo_cli.stages.stage_inputs import PlanInputs

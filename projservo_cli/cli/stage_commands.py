@@ -15,7 +15,7 @@ from projservo_cli.cli.program import FAILED, main
 from projservo_cli.deviations import CURVES
 
 if TYPE_CHECKING:
-    from projservo_cli.chain.making import Chain
+    from projservo_cli.chain.execution import Chain
     from projservo_cli.config import Config
     from projservo_cli.records import WorkFailed
     from projservo_cli.store.run_file import Run
@@ -135,7 +135,7 @@ def _record(stages: Sequence[str], /, console: Console, **options: Any) -> int:
     from projservo_cli.chain.recordings import data_table, recording_made
     from projservo_cli.config.inputs import recording_inputs
     from projservo_cli.stages.record import new_recording
-    from projservo_cli.store.files import writing
+    from projservo_cli.store.files_and_locks import writing
 
     config = option.configured(options["config"], options)
     path = options["output"] or data_table(config)
@@ -317,8 +317,8 @@ def _make(console: Console, names: Sequence[str], options: Mapping[str, Any]) ->
     """Make the named stages and their missing inputs; return the exit code."""
     if options["threads"] is not None:  # read by the compiler's runtime when it is first imported
         os.environ["NUMBA_NUM_THREADS"] = str(options["threads"])
-    from projservo_cli.chain.making import FIGURES
-    from projservo_cli.store.files import tidy, working_in, writing
+    from projservo_cli.chain.execution import FIGURES
+    from projservo_cli.store.files_and_locks import tidy, working_in, writing
 
     chain = _asked(console, names, options)
     if options["dry_run"]:
@@ -352,7 +352,7 @@ def _asked(
 
     recording : where it was made just now.
     """
-    from projservo_cli.chain.making import Chain
+    from projservo_cli.chain.execution import Chain
     from projservo_cli.chain.recordings import pending_recording
     from projservo_cli.config import Override
 
@@ -450,7 +450,7 @@ def _from_sweep(options: Mapping[str, Any]) -> tuple["Config", "Run"]:
 
 def _run_of(options: Mapping[str, Any], config: "Config") -> "Run":
     """The run where the user says, else in the folder of the configuration's name; empty where none is."""
-    from projservo_cli.store.files import require_inside
+    from projservo_cli.store.files_and_locks import require_inside
     from projservo_cli.store.run_file import stored
 
     folder = options["output"]
@@ -462,7 +462,7 @@ def _run_of(options: Mapping[str, Any], config: "Config") -> "Run":
 
 def _require_optional(config: Any, wanted: Sequence[str]) -> None:
     """Make sure, before any work, that ``view`` and ``animation`` can be made where they are wanted."""
-    from projservo_cli.config.whole import truth_of
+    from projservo_cli.config.settings_and_rules import truth_of
     from projservo_cli.records import InputError
     from projservo_cli.report.animation import plotly
 
@@ -557,7 +557,7 @@ def _announce(console: Console, chain: "Chain") -> None:
 def _print_sweep(console: Console, sweep: Path, options: Mapping[str, Any]) -> int:
     """Write the report of a sweep and print its tables; the exit code."""
     from projservo_cli.report.style import FORMATS
-    from projservo_cli.store.files import working_in
+    from projservo_cli.store.files_and_locks import working_in
     from projservo_cli.sweeps.folder import Folder
     from projservo_cli.sweeps.statistics import report
 

@@ -22,9 +22,9 @@ from projservo_cli.settings.robot import Rig, RobotSettings, like_degrees
 from projservo_cli.settings.sections import JointVector, Note, Root, Whole
 from projservo_cli.settings.task import Goal, GoalImages, TaskSettings, TaskStep, Trajectory, sigma_key
 from projservo_cli.settings.trials import CalibrationSettings, Data, Noise
-from projservo_cli.simulation.described import described_truth
-from projservo_cli.simulation.streams import NORMAL, NoiseShape
-from projservo_cli.simulation.workspace import Truth
+from projservo_cli.simulation.from_settings import described_truth
+from projservo_cli.simulation.ground_truth import Truth
+from projservo_cli.simulation.random_streams import NORMAL, NoiseShape
 from projservo_cli.store.display import Printed
 
 

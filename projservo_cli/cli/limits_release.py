@@ -40,7 +40,7 @@ def _limits(console: Console, *, config: str, shift: tuple[int, ...]) -> None:
     """
     from projservo_cli.config.editing import with_limits
     from projservo_cli.hardware import taught_limits
-    from projservo_cli.store.files import text_of, write_whole
+    from projservo_cli.store.files_and_locks import text_of, write_whole
 
     path = Path(config).resolve()  # the file itself where the name is a link
     text = text_of(Path(config), "a configuration", _MAX_BYTES)
@@ -89,7 +89,7 @@ def _release(console: Console, *, config: str) -> None:
     Switches the torque of all its servos off, the gripper's too. The arm falls where nobody holds it.
     """
     from projservo_cli.findings import REFUSES, Finding
-    from projservo_cli.store.files import text_of
+    from projservo_cli.store.files_and_locks import text_of
     from projservo_cli.words import failed
 
     text = text_of(Path(config), "a configuration", _MAX_BYTES)
