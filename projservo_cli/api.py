@@ -28,6 +28,7 @@ from projservo_cli.config.sweep import SweepConfig
 from projservo_cli.experiment import Experiment, law_target, plan_scene_of
 from projservo_cli.laws import CODES, REGULATE, law_and_mode, run_name, run_names
 from projservo_cli.loop.jit_notice import compilation
+from projservo_cli.messages import sentence
 from projservo_cli.observations import Observations, require_observations
 from projservo_cli.records import Calibration, FloatArray, InputError, JointList, Plan
 from projservo_cli.result_hashes import File
@@ -49,7 +50,6 @@ from projservo_cli.sweeps.design import Design, require_sound
 from projservo_cli.sweeps.folder import Folder, run_sweep
 from projservo_cli.sweeps.statistics import Study
 from projservo_cli.sweeps.workers import Engine
-from projservo_cli.words import sentence
 
 _WITHOUT_TASKS = 20  # default runs of a cell
 _NO_LAW = "law {!r:.40}: expected a name, or a class or function that makes a law"

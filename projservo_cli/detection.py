@@ -15,10 +15,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import ndtr
 
-from projservo_cli import words
+from projservo_cli import messages
 from projservo_cli.findings import REFUSES, Finding, Subject
 from projservo_cli.geometry.least_squares import Equations, levenberg_marquardt
 from projservo_cli.image_size import natural
+from projservo_cli.messages.rows_by_code import Setup
 from projservo_cli.records import (
     CORNERS,
     BoolArray,
@@ -29,7 +30,6 @@ from projservo_cli.records import (
     Observation,
     board_numberings,
 )
-from projservo_cli.words.table import Setup
 
 DICTIONARY = "4X4_50"
 """Of tags, where none is given."""
@@ -538,7 +538,7 @@ class Finder(ABC):
         if image is None:
             raise InputError(f"{path}: not an image that OpenCV can read; save it again, as PNG for example")
         if wrong := unfit(image):
-            raise InputError(f"{path}: {words.line(wrong)}")
+            raise InputError(f"{path}: {messages.line(wrong)}")
         if image.ndim > 2:
             flags = self.cv.IMREAD_GRAYSCALE | self.cv.IMREAD_IGNORE_ORIENTATION
             image = self.cv.imdecode(content, flags)
@@ -1035,11 +1035,13 @@ def observe_tags(
     for view in sorted({*range(len(cameras))} - {view for _, view, _ in findings.images}):
         if count := finder.mirrored([views[view] for _, *views in pairs]):
             where = Subject(views=(cameras[view],))
-            raise words.failed([Finding("mirrored_files", REFUSES, where, count, limit=len(pairs), unit="1")])
+            raise messages.failed(
+                [Finding("mirrored_files", REFUSES, where, count, limit=len(pairs), unit="1")]
+            )
     if not findings.images and findings.ambiguous:
-        raise words.failed([Finding("all_repeated", REFUSES, amount=findings.ambiguous, unit="1")])
+        raise messages.failed([Finding("all_repeated", REFUSES, amount=findings.ambiguous, unit="1")])
     if not findings.images:
-        raise words.failed([finder.absent([path for _, *views in pairs for path in views])])
+        raise messages.failed([finder.absent([path for _, *views in pairs for path in views])])
     numbers, each = findings.tags, finder.corners if points == "corners" else 1
     values = np.full((len(pairs), len(cameras), len(numbers), each, 3), np.nan)
     for (k, view, number), pixels in findings.images.items():
@@ -1050,9 +1052,9 @@ def observe_tags(
     images, sigma = values[..., :2], values[..., 2]
     observation = Observation(pose, marker, q, images, sigma=sigma, view=tuple(cameras))
     if not np.isfinite(images).any():
-        raise words.failed([Finding("rejected_markers", REFUSES, amount=images[..., 0].size, unit="1")])
+        raise messages.failed([Finding("rejected_markers", REFUSES, amount=images[..., 0].size, unit="1")])
     if len(cameras) > 1 and (np.isfinite(images[..., 0]).sum(axis=1) < 2).all():
-        raise words.failed([Finding("unpaired_images", REFUSES)], Setup(view=cameras))
+        raise messages.failed([Finding("unpaired_images", REFUSES)], Setup(view=cameras))
     return observation, findings
 
 

@@ -1,6 +1,6 @@
 """Findings: what a judgement says of a calibration, a robot, a plan or a run, as data.
 
-``projservo_cli.words`` has the sentences.
+``projservo_cli.messages`` has the sentences.
 """
 
 import math
@@ -35,7 +35,7 @@ class Subject:
 class Finding:
     """One thing that is off, or limits, or refuses."""
 
-    code: str  # a key of ``words.ROWS``
+    code: str  # a key of ``messages.ROWS``
     severity: str = NOTE
     subject: Subject = Subject()
     amount: float = math.nan  # in ``unit``; NaN where there is none, as of the next

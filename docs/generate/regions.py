@@ -17,10 +17,10 @@ from projservo_cli.cli.equations import REGISTER
 from projservo_cli.config.schema import json_schema, sweep_schema
 from projservo_cli.laws import INCIDENCES, LAW_SPECS, MODES, POINT_LAWS
 from projservo_cli.loop import verdicts as loop_verdicts
+from projservo_cli.messages import ROWS
+from projservo_cli.messages.verdicts import VERDICTS
 from projservo_cli.report.figures import FIGURES
 from projservo_cli.sweeps.runs import BETWEEN, NUMBERED, measured_columns
-from projservo_cli.words import ROWS
-from projservo_cli.words.reasons import VERDICTS
 
 # Where a run file holds which record.
 GROUPS = {

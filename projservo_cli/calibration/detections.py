@@ -17,6 +17,8 @@ import numpy as np
 from scipy.special import chdtri
 
 from projservo_cli.findings import LIMITS, REACH_M, REACH_RAD, Finding, Subject
+from projservo_cli.messages.placeholders import quantity
+from projservo_cli.messages.rows_by_code import Setup
 from projservo_cli.records import (
     TOOL,
     VIEWS,
@@ -29,8 +31,6 @@ from projservo_cli.records import (
     WorkFailed,
     prismatic_of,
 )
-from projservo_cli.words.table import Setup
-from projservo_cli.words.values import quantity
 
 # Difference, rad or m, below which two joint readings are equal: far below any encoder's resolution.
 _SAME_READING = 1e-7

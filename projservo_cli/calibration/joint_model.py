@@ -21,6 +21,7 @@ from projservo_cli.calibration.initial.epipolar import ImageGeometry
 from projservo_cli.calibration.robust_fit import Solution, fit_from, left_out_errors, left_out_px
 from projservo_cli.deviations import ARGUMENTS, BASIS, CURVES, DEVIATIONS, PAIR
 from projservo_cli.geometry.joint_curve import basis, slopes, torques
+from projservo_cli.messages.placeholders import quantity
 from projservo_cli.records import (
     NO_CURVE,
     TOOL,
@@ -30,7 +31,6 @@ from projservo_cli.records import (
     JointCurve,
     WorkFailed,
 )
-from projservo_cli.words.values import quantity
 
 AUTO = "auto"
 # Standard deviations of chance by which squared errors at left-out poses must fall.

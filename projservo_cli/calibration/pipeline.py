@@ -64,6 +64,7 @@ from projservo_cli.calibration.time_offset import with_time_offset
 from projservo_cli.findings import LIMITS, REFUSES, Finding, Subject, columns
 from projservo_cli.geometry.lens import K1
 from projservo_cli.image_size import ImageSize, border_distance, image_sizes
+from projservo_cli.messages import judged, with_findings
 from projservo_cli.records import (
     FROM_ONE,
     TOOL,
@@ -87,7 +88,6 @@ from projservo_cli.records import (
     changed,
     letters_of,
 )
-from projservo_cli.words import judged, with_findings
 
 # Fitted over expected noise above which a fit that passes may still have one joint at fault.
 _DOUBTFUL_RATIO = 2.0

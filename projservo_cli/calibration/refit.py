@@ -44,6 +44,7 @@ from projservo_cli.calibration.robust_fit import MAX_PREDICTED, REFUSE_RATIO, in
 from projservo_cli.findings import LIMITS, NOTE, REFUSES, Finding, Subject
 from projservo_cli.geometry.lens import TERMS, undistort
 from projservo_cli.image_size import ImageSize, image_sizes
+from projservo_cli.messages import failed, with_findings
 from projservo_cli.records import (
     TOOL,
     BoolArray,
@@ -58,7 +59,6 @@ from projservo_cli.records import (
     apart,
     changed,
 )
-from projservo_cli.words import failed, with_findings
 
 # Minimum number of detections: a camera has 11 numbers, and as many are left to judge them.
 _LEAST = 12

@@ -24,8 +24,8 @@ from projservo_cli.calibration.initial.triangulation import Tracks
 from projservo_cli.calibration.joint_noise import NO_JOINT_NOISE, JointNoise
 from projservo_cli.calibration.prediction import Parameters
 from projservo_cli.findings import LIMITS, REFUSES, Finding, Subject
+from projservo_cli.messages import refused
 from projservo_cli.records import BoolArray, Errors, FloatArray, IntArray, WorkFailed
-from projservo_cli.words import refused
 
 # Fitted over expected noise above which residuals exceed pixel noise.
 WARN_RATIO = 1.15

@@ -16,8 +16,8 @@ from scipy.special import stdtrit
 from projservo_cli.calibration.detections import MAD, per_rad
 from projservo_cli.calibration.prediction import joint_derivative, predict
 from projservo_cli.findings import LIMITS, Finding, Subject
+from projservo_cli.messages import with_findings
 from projservo_cli.records import Calibration, FloatArray, InputError, IntArray, Observation, TimeOffset
-from projservo_cli.words import with_findings
 
 # Minimum time offset searched, s: stamps of another clock may be early.
 _EARLIEST = -0.1

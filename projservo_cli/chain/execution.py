@@ -18,12 +18,12 @@ from projservo_cli.config.inputs import about_of, scenery_of, suggestion_inputs
 from projservo_cli.findings import Finding
 from projservo_cli.laws import CODES, POINT_LAWS, codes_of, law_and_mode, must_converge, run_name
 from projservo_cli.loop.jit_notice import compilation
+from projservo_cli.messages import failed, line
+from projservo_cli.messages.verdicts import arrived, meaning
 from projservo_cli.records import InputError, Plan, WorkFailed
 from projservo_cli.result_hashes import digest
 from projservo_cli.stages.stage_inputs import PlanInputs
 from projservo_cli.store.run_file import SERVO, Run, save
-from projservo_cli.words import failed, line
-from projservo_cli.words.reasons import arrived, meaning
 
 FIGURES = "figures"  # folder of a run in which a killed report may have left something
 

@@ -9,11 +9,11 @@ import numpy as np
 from projservo_cli.chain.outdated import Step
 from projservo_cli.config import Config
 from projservo_cli.config.inputs import servo_inputs
+from projservo_cli.messages import lines
 from projservo_cli.records import Action, Calibration, FloatArray, InputError, Plan, WorkFailed
 from projservo_cli.settings.task import TaskStep
 from projservo_cli.stages.stage_inputs import ServoInputs
 from projservo_cli.store.run_file import Run
-from projservo_cli.words import lines
 
 if TYPE_CHECKING:
     from projservo_cli.robots.session import Session

@@ -89,8 +89,8 @@ def _release(console: Console, *, config: str) -> None:
     Switches the torque of all its servos off, the gripper's too. The arm falls where nobody holds it.
     """
     from projservo_cli.findings import REFUSES, Finding
+    from projservo_cli.messages import failed
     from projservo_cli.store.files_and_locks import text_of
-    from projservo_cli.words import failed
 
     text = text_of(Path(config), "a configuration", _MAX_BYTES)
     with _servos(console, config, text, whole=False) as servos:
@@ -111,8 +111,8 @@ def _servos(console: Console, config: str, text: str, *, whole: bool = True) -> 
     from projservo_cli import plugins
     from projservo_cli.config.editing import named_plant
     from projservo_cli.hardware.so101 import SO101, connected, torque_reported
+    from projservo_cli.messages import line
     from projservo_cli.records import InputError
-    from projservo_cli.words import line
 
     use, options = named_plant(text, config)
     if (name := plugins.short_name(use)) != "so101":

@@ -197,13 +197,13 @@ def _in_metres(
 
     from projservo_cli.config import load_config
     from projservo_cli.config.inputs import joints_of
+    from projservo_cli.messages import failed, sentence
     from projservo_cli.metric.frame import MetricParameters
     from projservo_cli.metric.nominal_comparison import contradictions, errors_found
     from projservo_cli.metric.opencv import opencv_cameras
     from projservo_cli.records import TOOL
     from projservo_cli.results import ImageModel
     from projservo_cli.store import exports
-    from projservo_cli.words import failed, sentence
 
     calibration, config = ImageModel.of(run.calibration), load_config(run.path, text=run.configuration)
     length_m, ends, std = length

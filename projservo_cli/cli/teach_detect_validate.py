@@ -62,13 +62,13 @@ def _teach(
     """
     from projservo_cli.config import plain_yaml
     from projservo_cli.config.inputs import plan_inputs, teach_inputs
+    from projservo_cli.messages import line
+    from projservo_cli.messages.placeholders import sharing
+    from projservo_cli.messages.rows_by_code import Setup
     from projservo_cli.records import InputError, WorkFailed
     from projservo_cli.settings.sections import JointVector
     from projservo_cli.stages import teach as stage
     from projservo_cli.store.files_and_locks import write_whole, writing
-    from projservo_cli.words import line
-    from projservo_cli.words.table import Setup
-    from projservo_cli.words.values import sharing
 
     output = output or Path("start.yaml" if start else "goal.yaml")
     option.require_new(output, force=force)
@@ -362,10 +362,10 @@ def _validate(
     from projservo_cli.calibration.checks.validation import median_limit
     from projservo_cli.config import load_config
     from projservo_cli.findings import REFUSES
+    from projservo_cli.messages import failed, order_advice, sentence, setup_of
     from projservo_cli.stages.validate import compared
     from projservo_cli.store.observation_tables import read_detections, read_table
     from projservo_cli.store.run_file import load
-    from projservo_cli.words import failed, order_advice, sentence, setup_of
 
     found = load(target)
     calibration = found.calibration

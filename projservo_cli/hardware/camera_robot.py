@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from projservo_cli import words
+from projservo_cli import messages
 from projservo_cli.detection import Corners, Finder
 from projservo_cli.findings import LIMITS, REFUSES, Finding, Subject
 from projservo_cli.hardware.video_cameras import Frame, VideoCamera
@@ -146,7 +146,7 @@ class CameraRobot:
         if mirrored := tags & {*(self._numbers // self.finder.corners).tolist()}:
             corners = tuple(self.finder.corners * number for number in sorted(mirrored))
             where = Subject(views=(self.view[view],), markers=corners)
-            raise words.failed([Finding("mirrored_image", REFUSES, where)])
+            raise messages.failed([Finding("mirrored_image", REFUSES, where)])
 
     def _corners(self, view: View | None) -> tuple[FloatArray, FloatArray]:
         """Pixels (m, 2) of all markers and their deviations (m,); NaN where unseen, rejected or lost."""

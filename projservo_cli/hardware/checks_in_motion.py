@@ -9,10 +9,10 @@ from scipy.interpolate import PchipInterpolator
 
 from projservo_cli.calibration.detections import per_rad
 from projservo_cli.findings import LIMITS, NOTE, REFUSES, Finding, Subject
+from projservo_cli.messages.placeholders import quantity
 from projservo_cli.records import CORNERS, VIEWS, BoolArray, FloatArray, IntArray
 from projservo_cli.robots.contract import Reading
 from projservo_cli.robots.pacing import Steered
-from projservo_cli.words.values import quantity
 
 # Angles are of revolute joints. Prismatic ones go the lengths that make as much of a difference to images.
 # How far a joint goes to each side, and how fast: quick strokes show the latency, slow ones the hysteresis.

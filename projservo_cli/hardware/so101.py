@@ -21,9 +21,9 @@ import numpy as np
 
 from projservo_cli.findings import LIMITS, REFUSES, Finding, Subject, told
 from projservo_cli.hardware.feetech import FeetechBus, PortLost, ServoSilent
+from projservo_cli.messages import failed, line
+from projservo_cli.messages.placeholders import servo_name
 from projservo_cli.records import FloatArray, InputError, JointLimits, WorkFailed
-from projservo_cli.words import failed, line
-from projservo_cli.words.values import servo_name
 
 TURN = 4096  # counts of a servo in a turn
 MIDDLE = 2048  # count that is read as 0 rad

@@ -10,8 +10,8 @@ import numpy as np
 
 from projservo_cli.findings import REFUSES, Finding
 from projservo_cli.hardware.so101 import COUNT, MIDDLE, TURN, Registers, Servos
+from projservo_cli.messages import failed
 from projservo_cli.records import InputError, WorkFailed
-from projservo_cli.words import failed
 
 # Pause between readings, s, and readings whose median counts: a false one is none.
 _PERIOD_S, _MEDIAN = 0.02, 3

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from projservo_cli import words
+from projservo_cli import messages
 from projservo_cli.detection import opencv, unfit
 from projservo_cli.findings import LIMITS, REFUSES, Finding, Subject
 from projservo_cli.passwords import masked
@@ -92,7 +92,7 @@ class VideoCamera:
         return f"the {self.name} camera (cameras.{self.name}.source: {self.settings.source})"
 
     def _failed(self, why: Finding) -> WorkFailed:
-        return words.failed([why], stage=self.where)
+        return messages.failed([why], stage=self.where)
 
     def open(self) -> None:
         """Connect, and wait for the first frame; WorkFailed if there is none."""

@@ -29,9 +29,9 @@ from projservo_cli.loop.verdicts import (
     Log,
     on_plateau,
 )
+from projservo_cli.messages.verdicts import VERDICTS
 from projservo_cli.records import FloatArray, Plan
 from projservo_cli.task.face import Task
-from projservo_cli.words.reasons import VERDICTS
 
 # Periods between checks of the path ahead, by the mean offset of the images in the last ones.
 _EVERY, _LAST = 10, 5

@@ -20,6 +20,7 @@ from projservo_cli.geometry.displacements import (
     rigid_inverse,
     screw_displacements,
 )
+from projservo_cli.messages import failed, lines
 from projservo_cli.metric.frame import Metric, MetricParameters, base_frame, base_joints, directions, in_frame
 from projservo_cli.records import (
     TOOL,
@@ -29,7 +30,6 @@ from projservo_cli.records import (
     IntArray,
     letters_of,
 )
-from projservo_cli.words import failed, lines
 
 # Errors of axes that any model has, of machining and assembly, rad and m.
 _LINK_STD = np.repeat([5e-4, 5e-4], 3)

@@ -13,6 +13,7 @@ from markupsafe import Markup
 from projservo_cli.geometry.kinematics import forward_kinematics
 from projservo_cli.image_size import ImageSize, image_sizes
 from projservo_cli.laws import BODY_LAWS, POINT_LAWS
+from projservo_cli.messages.verdicts import arrived
 from projservo_cli.records import BoolArray, ByteArray, FloatArray, InputError, IntArray, Plan, Trace
 from projservo_cli.report import style
 from projservo_cli.report.figures.images import OF_SCENE, OF_TOOL, frames_of, with_halo
@@ -31,7 +32,6 @@ from projservo_cli.simulation.analytic_plant import Plant
 from projservo_cli.simulation.arm import SerialArm
 from projservo_cli.store.files_and_locks import replacing, write_whole
 from projservo_cli.task.face import center_of
-from projservo_cli.words.reasons import arrived
 
 _MOST_INSTANTS = 60
 _DOTS = 9  # on the planned path

@@ -12,6 +12,8 @@ from projservo_cli.geometry.displacements import displacements, normalize_displa
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
 from projservo_cli.laws import title_of
 from projservo_cli.loop.verdicts import plateau_stretch
+from projservo_cli.messages.placeholders import joined
+from projservo_cli.messages.verdicts import arrived
 from projservo_cli.records import FloatArray, Trace
 from projservo_cli.report.figures.path_deviation import study_numbers
 from projservo_cli.report.report_data import (
@@ -23,8 +25,6 @@ from projservo_cli.report.report_data import (
     curve_difference,
     percent,
 )
-from projservo_cli.words.reasons import arrived
-from projservo_cli.words.values import joined
 
 
 class _Claim(NamedTuple):

@@ -16,6 +16,7 @@ from projservo_cli.calibration.checks.observability_and_verdict import WEAK_NOIS
 from projservo_cli.calibration.robust_fit import chi2_band
 from projservo_cli.findings import REACH_M, REACH_RAD
 from projservo_cli.laws import must_converge, run_name
+from projservo_cli.messages.verdicts import arrived
 from projservo_cli.records import Plan, Report
 from projservo_cli.report.figures import FIGURES
 from projservo_cli.report.figures.path_deviation import drift_rows
@@ -32,7 +33,6 @@ from projservo_cli.report.style import FORMATS
 from projservo_cli.store.display import About
 from projservo_cli.store.files_and_locks import lies_inside, write_whole
 from projservo_cli.store.run_file import Run
-from projservo_cli.words.reasons import arrived
 
 
 def _calibration_words(values: Mapping[str, Any], *, estimated: bool) -> Iterator[str]:

@@ -16,6 +16,7 @@ from projservo_cli.calibration.joint_model import describe_curve
 from projservo_cli.findings import REFUSES, Finding, named, of_readings, told
 from projservo_cli.geometry.kinematics import project
 from projservo_cli.laws import IMAGE_TRACK, REGULATE, TRACK, law_and_mode, title_of
+from projservo_cli.messages import line, sentence, setup_of
 from projservo_cli.metric.frame import Metric
 from projservo_cli.planning.motion_margins import CONSTRAINTS, OF_MOTION
 from projservo_cli.records import (
@@ -37,7 +38,6 @@ from projservo_cli.settings.task import Trajectory
 from projservo_cli.simulation.analytic_plant import Plant
 from projservo_cli.simulation.arm import SerialArm
 from projservo_cli.store.run_file import Run
-from projservo_cli.words import line, sentence, setup_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

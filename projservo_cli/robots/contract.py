@@ -16,6 +16,7 @@ import numpy as np
 from projservo_cli.calibration.time_offset import is_repeated_frame, time_unit
 from projservo_cli.findings import REFUSES, Finding, Subject, told
 from projservo_cli.image_size import ImageSize, image_sizes
+from projservo_cli.messages import failed
 from projservo_cli.plugins import what_failed
 from projservo_cli.records import (
     VIEWS,
@@ -27,7 +28,6 @@ from projservo_cli.records import (
     WorkFailed,
     in_unit,
 )
-from projservo_cli.words import failed
 
 # Time a robot has to come to rest, and then to be closed, s; until then not even Ctrl-C ends the waiting.
 STOP_S = 10.0

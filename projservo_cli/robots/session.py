@@ -6,11 +6,11 @@ from types import TracebackType
 from typing import Self
 
 from projservo_cli.findings import NOTE, REFUSES, Finding, Subject
+from projservo_cli.messages import failed
 from projservo_cli.records import FloatArray, InputError, WorkFailed
 from projservo_cli.robots.contract import PluginRobot, at_rest_after
 from projservo_cli.robots.object_watch import LOOKS, ObjectWatch
 from projservo_cli.robots.pacing import Steered
-from projservo_cli.words import failed
 
 
 class Session:

@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from projservo_cli.findings import REFUSES, Finding, Subject
+from projservo_cli.messages import failed
 from projservo_cli.records import BoolArray, FloatArray, IntArray, Observation
 from projservo_cli.robots.contract import PluginRobot, Reading
-from projservo_cli.words import failed
 
 # Drift of a joint, rad or m, and of an image, px rms, within which both count as still.
 STILL, _STILL_PX = 2e-5, 0.02

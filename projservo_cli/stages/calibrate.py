@@ -15,6 +15,8 @@ from projservo_cli.calibration.pipeline import calibrate
 from projservo_cli.calibration.refit import refit, since_moved
 from projservo_cli.calibration.robust_fit import Solution
 from projservo_cli.geometry.lens import K1
+from projservo_cli.messages import lines, with_findings
+from projservo_cli.messages.rows_by_code import Setup
 from projservo_cli.observations import Observations
 from projservo_cli.planning.pose_selection import FARTHER, Suggestion, region_around, suggest
 from projservo_cli.records import (
@@ -42,8 +44,6 @@ from projservo_cli.stages.stage_inputs import (
 from projservo_cli.store.files_and_locks import write_whole
 from projservo_cli.store.nominal_robot import read_nominal
 from projservo_cli.store.observation_tables import mount_in, read_detections, read_table, to_csv
-from projservo_cli.words import lines, with_findings
-from projservo_cli.words.table import Setup
 
 _Calibrated = tuple[Observation, Calibration, CrossValidation | None]
 

@@ -6,7 +6,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from projservo_cli import words
+from projservo_cli import messages
 from projservo_cli.calibration.prediction import error_factor_with_model
 from projservo_cli.findings import REFUSES, Finding, Subject
 from projservo_cli.metric.frame import Metric, Scale
@@ -63,7 +63,7 @@ def _carried(scenario: Scenario, carrier: CarryingObject, session: Session | Non
         found = DisplacedObject.of(c, carrier.numbers, [taught, now], metric)
         goal = found.carry(_goal(scenario, c))
     except WorkFailed as error:
-        raise words.failed(error.findings, stage=f"objects.{carrier.name}") from error
+        raise messages.failed(error.findings, stage=f"objects.{carrier.name}") from error
     rigid, limits = found.coordinates == 6, carrier.objects
     carried = CarriedByObject(
         object_name=carrier.name,
@@ -86,7 +86,7 @@ def _carried(scenario: Scenario, carrier: CarryingObject, session: Session | Non
         if at is not None and at > (most := getattr(limits, key)):
             per, of = {"mm": (1e-3, "m")}.get(unit, (1.0, unit)), Subject(name=key)
             inexact = Finding("carried_inexact", REFUSES, of, per[0] * at, limit=per[0] * most, unit=per[1])
-            raise words.failed([inexact], stage=f"objects.{carrier.name}")
+            raise messages.failed([inexact], stage=f"objects.{carrier.name}")
     return carried
 
 

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from projservo_cli import words
+from projservo_cli import messages
 from projservo_cli.calibration.refit import ViewError, view_errors
 from projservo_cli.detection import DICTIONARY, finder_of
 from projservo_cli.findings import LIMITS, NOTE, REFUSES, Finding, Subject, told, usable
@@ -16,6 +16,7 @@ from projservo_cli.hardware.checks_at_rest import RobotAtRest, findings_at_rest
 from projservo_cli.hardware.checks_in_motion import Strokes, findings_of, reach_of, strokes
 from projservo_cli.hardware.video_cameras import VideoCamera
 from projservo_cli.image_size import ImageSize, image_corners, image_sizes
+from projservo_cli.messages.rows_by_code import Setup
 from projservo_cli.monitoring.arrival_accuracy import resting_error_mm
 from projservo_cli.monitoring.fault_at_rest import fault_at_rest
 from projservo_cli.monitoring.frame_pairs import at_known_markers, mean_image
@@ -28,7 +29,6 @@ from projservo_cli.robots.standstill import frames_of
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.stage_inputs import OwnRobot, PreflightInputs
 from projservo_cli.stages.worlds.external_robot import plugin_robot
-from projservo_cli.words.table import Setup
 
 # Time of observation of a robot at rest, s, and minimum number of readings.
 _LOOK_S, _MIN_LOOKS = 1.5, 8
@@ -52,14 +52,14 @@ class Checked(NamedTuple):
     @property
     def rows(self) -> list[dict[str, Any]]:
         """The findings as rows of a table and as data."""
-        return [words.row(one, self.setup) | one.plain() for one in self.findings]
+        return [messages.row(one, self.setup) | one.plain() for one in self.findings]
 
     @property
     def refuted(self) -> str | None:
         """Reason why the calibration holds no more, empty where it does; None where it was not compared."""
         for one in self.findings:
             if one.code in ("agrees", "refuted"):
-                return "" if one.code == "agrees" else words.sentence(one, self.setup)
+                return "" if one.code == "agrees" else messages.sentence(one, self.setup)
         return None
 
 

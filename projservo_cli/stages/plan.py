@@ -16,6 +16,8 @@ from projservo_cli.geometry.lens import undistort
 from projservo_cli.geometry.null_space import COORDINATES, RANK_TOLERANCE
 from projservo_cli.image_size import image_sizes
 from projservo_cli.loop.task_start import begin
+from projservo_cli.messages import failed, line, lines, setup_of, text
+from projservo_cli.messages.rows_by_code import Setup
 from projservo_cli.monitoring.arrival_accuracy import RigidFit, metric_points, rigid_fit
 from projservo_cli.monitoring.fault_at_rest import fault_at_rest
 from projservo_cli.planning.incidence_goals import goals_meeting
@@ -66,8 +68,6 @@ from projservo_cli.task.visibility import (
     visibility_angles,
     visibility_translation,
 )
-from projservo_cli.words import failed, line, lines, setup_of, text
-from projservo_cli.words.table import Setup
 
 
 def _partitioned(

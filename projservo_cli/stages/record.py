@@ -12,11 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from projservo_cli import words
+from projservo_cli import messages
 from projservo_cli.calibration.detections import per_rad
 from projservo_cli.detection import DICTIONARY, MIN_CELL, cells_of
 from projservo_cli.findings import NOTE, REFUSES, Finding, Subject
 from projservo_cli.hardware.checks_at_rest import MIN_SHARED
+from projservo_cli.messages.rows_by_code import Setup
 from projservo_cli.records import (
     CORNERS,
     VIEWS,
@@ -41,7 +42,6 @@ from projservo_cli.stages.stage_inputs import OwnRobot, RecordingInputs, Trials
 from projservo_cli.stages.worlds.external_robot import path_to, plugin_robot, simulated_robot
 from projservo_cli.store.files_and_locks import write_whole
 from projservo_cli.store.observation_tables import identity_in, read_table, recording_of, write_table
-from projservo_cli.words.table import Setup
 
 _SAVE_EVERY = 1.0  # s; maximum loss by an interruption without warning
 _SLACK = 1e-3  # rad or m; how far beyond its sag a reading may be from where the pose was to be
@@ -94,7 +94,7 @@ class _Recording:
         i = int(off.argmax())
         counts = tuple(Finding("seen", amount=count) for count in seen)
         unit = "m" if units and units[i] == "m" else "rad"
-        return words.line(
+        return messages.line(
             Finding("farthest_off", NOTE, Subject(joints=(i + 1,)), off[i], unit=unit, others=counts)
         )
 
@@ -166,7 +166,7 @@ def trial_motions(trials: Trials) -> FloatArray:
             q[i] += offset
             if wrong := joints.limit_passed(q):
                 raise InputError(
-                    f"calibration: in a trial {words.sentence(wrong)}: choose another "
+                    f"calibration: in a trial {messages.sentence(wrong)}: choose another "
                     "calibration.reference or a smaller amplitude"
                 )
             rows.append(q)
@@ -237,7 +237,7 @@ def new_recording(
     if motions is not None:
         for pose, q in zip(motions.pose, motions.q, strict=True):
             if wrong := joints.limit_passed(q):
-                raise InputError(f"motions: pose {pose}: {words.sentence(wrong)}: choose another")
+                raise InputError(f"motions: pose {pose}: {messages.sentence(wrong)}: choose another")
         targets = np.vstack([targets, motions.q])
     numbers = np.array(inputs.numbers, dtype=np.int64)
     recording = _Recording(path or Path(), key, targets, numbers, mount=inputs.mount)
@@ -430,7 +430,7 @@ class _Sight:
         period, waited = robot.bounds.period, 0.0
         while wrong := self._wrong(reading.s[None], Subject()):
             if waited >= self.inputs.trials.rest.settle_s:  # a camera may need some time for its first image
-                raise words.failed([wrong], self.setup, "; nothing was moved", stage="record")
+                raise messages.failed([wrong], self.setup, "; nothing was moved", stage="record")
             time.sleep(period)
             waited, reading = waited + period, robot.read()
 
@@ -451,7 +451,7 @@ class _Sight:
                 ", or choose another calibration.reference or a smaller calibration.amplitude_deg; then "
                 "start again with --force (force=True)"
             )
-            raise words.failed([wrong], self.setup, end, stage="record")
+            raise messages.failed([wrong], self.setup, end, stage="record")
 
     @property
     def setup(self) -> Setup:

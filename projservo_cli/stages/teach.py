@@ -8,12 +8,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from projservo_cli import words
+from projservo_cli import messages
 from projservo_cli.calibration.checks.validation import of_views
 from projservo_cli.calibration.prediction import predict
 from projservo_cli.findings import LIMITS, REFUSES, Finding, Subject
 from projservo_cli.hardware.checks_at_rest import MIN_SHARED
 from projservo_cli.image_size import image_sizes
+from projservo_cli.messages.rows_by_code import Setup
 from projservo_cli.monitoring.fault_at_rest import fault_at_rest
 from projservo_cli.records import (
     BoolArray,
@@ -37,7 +38,6 @@ from projservo_cli.stages.stage_inputs import OwnRobot, PlanInputs, TeachInputs
 from projservo_cli.stages.worlds.external_robot import plugin_robot, simulated_robot, takes_limits
 from projservo_cli.store.display import require_radians
 from projservo_cli.task.displaced_object import RIGID
-from projservo_cli.words.table import Setup
 
 _FAR = 4.0  # standard deviations that a marker may be off
 _DIGITS = 4  # of pixels that are written
@@ -211,7 +211,7 @@ def _within_limits(at: JointVector, joints: Joints) -> FloatArray:
     if wrong := joints.limit_passed(q):
         if at.unit == "rad":
             require_radians("--at", q, joints.types, "set --at-unit deg")
-        raise InputError(f"--at: {words.sentence(wrong)}: choose others")
+        raise InputError(f"--at: {messages.sentence(wrong)}: choose others")
     return q
 
 
@@ -221,7 +221,7 @@ def _require_still(bounds: Bounds, before: FloatArray, after: FloatArray, code: 
     i = int(np.argmax(off / most))
     if off[i] > most[i]:
         found = Finding(code, REFUSES, Subject(joints=(i + 1,)), off[i], limit=most[i], unit=bounds.unit(i))
-        raise words.failed([found], end="; nothing was written", stage="teach")
+        raise messages.failed([found], end="; nothing was written", stage="teach")
 
 
 def _put_to(inputs: TeachInputs, simulated: SimulatedRobot, q: FloatArray) -> FaultyRobot:
@@ -270,8 +270,8 @@ def checked(inputs: PlanInputs, calibration: Calibration, taught: _Taught) -> _C
     size, noise_px = image_sizes(inputs.image_size, calibration.view), inputs.noise.servo_px
     try:
         if fault := fault_at_rest(calibration, frames, size, sigma_px=noise_px, fresh=fresh):
-            setup = words.setup_of(calibration)
-            raise words.failed([fault], setup, "; teach it again", stage=planning.CHANGED)
+            setup = messages.setup_of(calibration)
+            raise messages.failed([fault], setup, "; teach it again", stage=planning.CHANGED)
         plan = planning.run(asked, calibration)
         reached, reason, found = plan.feasible, plan.reason, plan.findings
         q = plan.q[-1] if reached else taught.q
@@ -299,7 +299,7 @@ def require_start(taught: _Taught) -> None:
         few = Finding(
             "few_shared", REFUSES, amount=taught.shared, limit=len(taught.marker), unit="1", others=parts
         )
-        raise words.failed([few], Setup(view=taught.view), stage="teach")
+        raise messages.failed([few], Setup(view=taught.view), stage="teach")
 
 
 def require_objects(taught: _Taught, *, one_goal: bool) -> Finding | None:
@@ -314,7 +314,7 @@ def require_objects(taught: _Taught, *, one_goal: bool) -> Finding | None:
             hidden = Finding("hidden_object", LIMITS, subject, len(numbers), limit=RIGID, unit="1")
             if one_goal:
                 refusing = replace(hidden, severity=REFUSES)
-                raise words.failed([refusing], Setup(view=taught.view), stage="teach")
+                raise messages.failed([refusing], Setup(view=taught.view), stage="teach")
             return hidden
     return None
 
@@ -335,4 +335,4 @@ def require_face(face: Sequence[int], taught: _Taught, least: int | None = None)
     if unseen := [(number, side) for number, side in taught.unseen if number in {*face} - shared]:
         number, side = unseen[0]
         hidden = Finding("hidden_face", REFUSES, Subject(views=(side,), markers=(number,)))
-        raise words.failed([hidden], Setup(view=taught.view), stage="teach")
+        raise messages.failed([hidden], Setup(view=taught.view), stage="teach")

@@ -9,9 +9,9 @@ from projservo_cli.calibration.checks.validation import comparable, residual_sta
 from projservo_cli.calibration.detections import SAME_READING, even_choice
 from projservo_cli.findings import LIMITS
 from projservo_cli.image_size import ImageSize, image_sizes
+from projservo_cli.messages import lines, setup_of
 from projservo_cli.monitoring.fault_at_rest import fault_at_rest
 from projservo_cli.records import Calibration, Observation
-from projservo_cli.words import lines, setup_of
 
 # Frames, at most, by which what changed is told.
 _MOST_TOLD = 300

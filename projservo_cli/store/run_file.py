@@ -30,6 +30,8 @@ import numpy.typing as npt
 from pydantic import TypeAdapter, ValidationError
 
 from projservo_cli.findings import LIMITS, NOTE, REFUSES, Finding, of_columns, sparse, told
+from projservo_cli.messages import line, sentence, setup_of
+from projservo_cli.messages.verdicts import arrived
 from projservo_cli.records import (
     SIZES,
     VIEWS,
@@ -52,8 +54,6 @@ from projservo_cli.records import (
     scalars_of,
 )
 from projservo_cli.store.files_and_locks import replacing
-from projservo_cli.words import line, sentence, setup_of
-from projservo_cli.words.reasons import arrived
 
 if typing.TYPE_CHECKING:
     import h5netcdf

@@ -15,6 +15,8 @@ from projservo_cli.laws import CODES
 from projservo_cli.loop.batch import NUMBERS, VERDICT, Batch, Setting
 from projservo_cli.loop.compiled_loop import Course
 from projservo_cli.loop.verdicts import INTERRUPTED, RUNNING, VERDICT_NAMES
+from projservo_cli.messages import line
+from projservo_cli.messages.verdicts import VERDICTS
 from projservo_cli.records import (
     VIEWS,
     Calibration,
@@ -34,8 +36,6 @@ from projservo_cli.stages.servo import drive, sense_is_enough
 from projservo_cli.stages.stage_inputs import PlanInputs, ServoInputs
 from projservo_cli.store.sweep_table import Failure, Heading, merge_failures
 from projservo_cli.sweeps.design import RUNS, Design, name_of_run
-from projservo_cli.words import line
-from projservo_cli.words.reasons import VERDICTS
 
 _NOT_CALIBRATED, _NOT_STARTED = "not calibrated", "not started"
 # Reason of a compiled run that did not start.

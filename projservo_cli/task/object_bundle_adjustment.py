@@ -21,10 +21,10 @@ from projservo_cli.findings import REFUSES, Finding
 from projservo_cli.geometry.displacements import cross_matrix, generators, to_all_sides
 from projservo_cli.geometry.least_squares import Equations, levenberg_marquardt
 from projservo_cli.geometry.lens import undistort
+from projservo_cli.messages import failed
 from projservo_cli.metric.frame import ProjectiveParameters, changes_of, invariant_form
 from projservo_cli.records import BoolArray, Calibration, FloatArray, WorkFailed
 from projservo_cli.task.body_pose import make_body
-from projservo_cli.words import failed
 
 # Singular value over the largest, below which joints leave the plane at infinity open, or preserve a form.
 _OPEN = 1e-6

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from projservo_cli import Observations, calibrate
-from projservo_cli.words import order_advice
+from projservo_cli.messages import order_advice
 from tests.calibration.simulated_robot import around, random_robot, trials
 
 

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from projservo_cli import words
+from projservo_cli import messages
 from projservo_cli.calibration import calibrate, predict
 from projservo_cli.calibration.checks import model_errors
 from projservo_cli.deviations import CHANGES, DEVIATIONS
@@ -100,7 +100,7 @@ def test_every_row_of_the_table_is_tested_on_some_fit():
     kinds = {one.kind for one in model_errors._nuisances(solution.problem, solution.params, wide)}
     assert kinds == {*DEVIATIONS}
     assert all(other in DEVIATIONS for row in DEVIATIONS.values() if (other := row.cause))
-    assert all(row.code in words.ROWS and {*row.contains} <= {*CHANGES} for row in CHANGES.values())
+    assert all(row.code in messages.ROWS and {*row.contains} <= {*CHANGES} for row in CHANGES.values())
 
 
 @pytest.mark.parametrize(

@@ -15,10 +15,10 @@ import projservo_cli
 from docs.generate.regions import GROUPS
 from projservo_cli import cli
 from projservo_cli.config import load_config
+from projservo_cli.messages.rows_by_code import ROWS
 from projservo_cli.report import animation as film
 from projservo_cli.report.figures import FIGURES
 from projservo_cli.simulation.mjcf import mujoco
-from projservo_cli.words.table import ROWS
 from tests.configured import draw_only, truth_of
 from tests.detection.rendering import render, square
 from tests.documentation.blocks import PAGES, ROOT, blocks_of, run_page

@@ -16,10 +16,10 @@ from projservo_cli.findings import Subject
 from projservo_cli.hardware import video_cameras
 from projservo_cli.hardware.camera_robot import CameraRobot
 from projservo_cli.hardware.video_cameras import VideoCamera
+from projservo_cli.messages import line
 from projservo_cli.records import WorkFailed
 from projservo_cli.settings.cameras import Cameras as Stereo
 from projservo_cli.settings.cameras import Source
-from projservo_cli.words import line
 from tests.hardware.streams import Stream, picture
 
 SEEN = picture()

@@ -17,13 +17,13 @@ from projservo_cli.config import load_config
 from projservo_cli.config.inputs import calibration_inputs
 from projservo_cli.findings import NOTE, REFUSES, Finding, Subject, first
 from projservo_cli.hardware.checks_at_rest import RobotAtRest
+from projservo_cli.messages import line
 from projservo_cli.records import JointLimits, Observation
 from projservo_cli.report.image_pages import LivePage
 from projservo_cli.stages import calibrate
 from projservo_cli.stages.doctor import Checked, calibration_finding, mended_by_refit
 from projservo_cli.store.files_and_locks import working_in
 from projservo_cli.store.run_file import load
-from projservo_cli.words import line
 from tests.conftest import ROOT
 from tests.hardware.arms_in_motion import Faults, Rail, findings
 from tests.hardware.streams import Stream, picture

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from projservo_cli.findings import usable
+from projservo_cli.messages import with_findings
+from projservo_cli.messages.verdicts import arrived
 from projservo_cli.records import InputError, Plan, Trace, changed, flat_fields
 from projservo_cli.results import RunTrace
 from projservo_cli.store import run_file
 from projservo_cli.store.run_file import save_record
-from projservo_cli.words import with_findings
-from projservo_cli.words.reasons import arrived
 from tests.fake_records import fake
 from tests.store.deceit import EDITS, HEADS, edited, head, resealed
 from tests.store.sound import result, sound_file, sound_run

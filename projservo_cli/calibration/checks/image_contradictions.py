@@ -15,8 +15,8 @@ from projservo_cli.calibration.initial.single_view import RigidBody
 from projservo_cli.findings import REFUSES, Finding, Subject
 from projservo_cli.geometry.displacements import homogeneous
 from projservo_cli.image_size import FACTORS
+from projservo_cli.messages import failed
 from projservo_cli.records import BoolArray, FloatArray, IntArray, Observation, WorkFailed
-from projservo_cli.words import failed
 
 # Minimum number of poses at which both views saw a marker, to judge its number.
 _MIN_POSES = 8

@@ -16,8 +16,8 @@ from projservo_cli.calibration.detections import MIN_MOTION, SAME_READING, Detec
 from projservo_cli.calibration.prediction import Parameters
 from projservo_cli.calibration.robust_fit import OPEN_DIRECTION, Solution
 from projservo_cli.findings import REFUSES, Finding, Subject
+from projservo_cli.messages import failed
 from projservo_cli.records import FloatArray, IntArray
-from projservo_cli.words import failed
 
 # Increase of χ² by another order above which the images decide against it: ten standard deviations.
 _DECISIVE = 100.0

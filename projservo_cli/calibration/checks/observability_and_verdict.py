@@ -22,8 +22,8 @@ from projservo_cli.calibration.joint_noise import quantile
 from projservo_cli.calibration.prediction import Parameters
 from projservo_cli.calibration.robust_fit import Expected, Solution
 from projservo_cli.findings import LIMITS, NOTE, REACH_M, REACH_RAD, REFUSES, Finding, Subject
+from projservo_cli.messages import failed
 from projservo_cli.records import BoolArray, Errors, FloatArray, IntArray, apart
-from projservo_cli.words import failed
 
 # Noise of predictions at the reach, in units of the pixel noise, above which a joint is undetermined.
 UNDETERMINED_NOISE = 1000.0

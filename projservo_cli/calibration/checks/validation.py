@@ -18,6 +18,7 @@ from projservo_cli.calibration.prediction import joint_derivative, predict, pred
 from projservo_cli.calibration.robust_fit import WARN_RATIO, Solution, fit_inliers
 from projservo_cli.findings import LIMITS, NOTE, REFUSES, Finding, Subject
 from projservo_cli.geometry.lens import undistort
+from projservo_cli.messages import failed, lines, setup_of, text
 from projservo_cli.records import (
     VIEWS,
     BoolArray,
@@ -30,7 +31,6 @@ from projservo_cli.records import (
     Observation,
     WorkFailed,
 )
-from projservo_cli.words import failed, lines, setup_of, text
 
 # Minimum number of parts in a cross-validation.
 _MIN_FOLDS = 2

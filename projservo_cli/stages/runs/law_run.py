@@ -29,6 +29,7 @@ from projservo_cli.loop.verdicts import (
     Log,
     new_log,
 )
+from projservo_cli.messages.rows_by_code import Setup
 from projservo_cli.records import (
     MM,
     FloatArray,
@@ -47,7 +48,6 @@ from projservo_cli.stages.scenario import RunScenario
 from projservo_cli.task.face import Task, center_of
 from projservo_cli.task.incidences import whole_pose
 from projservo_cli.task.target import TaskImages, followed
-from projservo_cli.words.table import Setup
 
 _RETREAT = 10  # periods by which an arm goes back where the object of its goal moves
 _NOT_DRIVEN: Any = None  # in place of what a run leaves

@@ -20,6 +20,8 @@ from projservo_cli.loop.verdicts import (
     plateau_stretch,
     tolerance,
 )
+from projservo_cli.messages import text
+from projservo_cli.messages.verdicts import VERDICTS, arrived
 from projservo_cli.monitoring.arrival_accuracy import Posture, rigid_fit
 from projservo_cli.monitoring.innovation_tests import WINDOW
 from projservo_cli.records import (
@@ -50,8 +52,6 @@ from projservo_cli.task.incidences import (
 )
 from projservo_cli.task.object_bundle_adjustment import NO_POINTS, Look
 from projservo_cli.task.target import TaskImages
-from projservo_cli.words import text
-from projservo_cli.words.reasons import VERDICTS, arrived
 
 # Maximum residual of a body that agrees with its calibration, over the noise, px.
 _AGREES, _LEAST_NOISE_PX = 4.0, 0.01

@@ -15,6 +15,9 @@ from projservo_cli.findings import Finding
 from projservo_cli.geometry.algebra import mat
 from projservo_cli.image_size import image_sizes
 from projservo_cli.loop.run_metrics import Summary, angle_between
+from projservo_cli.messages import failed, order_advice, sentence
+from projservo_cli.messages.placeholders import all_of
+from projservo_cli.messages.rows_by_code import Setup
 from projservo_cli.records import (
     MM,
     TOOL,
@@ -39,9 +42,6 @@ from projservo_cli.stages.worlds.task_images import given_pixels, task_images
 from projservo_cli.task.body_pose import NO_BODY, Body, make_body
 from projservo_cli.task.object_bundle_adjustment import Look
 from projservo_cli.task.target import TaskImages, is_stereo
-from projservo_cli.words import failed, order_advice, sentence
-from projservo_cli.words.table import Setup
-from projservo_cli.words.values import all_of
 
 _UNKNOWN = Ends(np.full((4, 4), np.nan), np.full((4, 4), np.nan), np.full(4, np.nan))
 

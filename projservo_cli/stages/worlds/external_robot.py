@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
-from projservo_cli import plugins, words
+from projservo_cli import messages, plugins
 from projservo_cli.detection import finder_of
 from projservo_cli.findings import REFUSES, Finding, Subject
 from projservo_cli.hardware.camera_robot import Arm, CameraRobot
@@ -156,7 +156,7 @@ def path_to(
         of, others = Subject(joints=(i + 1,)), (found, *obstructions)
         short = Finding(code, REFUSES, of, gap[i], limit=q[i], unit=unit, others=others)
         again = "; then run the command again" + (" to continue" if what == "record" else "")
-        raise words.failed([short], end=again, stage=what)
+        raise messages.failed([short], end=again, stage=what)
 
 
 def simulated_robot(driven: Drive, joints: Joints, robot: FaultyRobot) -> PluginRobot:

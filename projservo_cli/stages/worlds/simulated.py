@@ -11,6 +11,7 @@ from projservo_cli.findings import Finding
 from projservo_cli.geometry.algebra import mat
 from projservo_cli.geometry.null_space import COORDINATES
 from projservo_cli.loop.run_metrics import Summary
+from projservo_cli.messages import sentence
 from projservo_cli.monitoring.arrival_accuracy import metres_a_unit
 from projservo_cli.planning.joints_from_images import NEAR_PX, joints_showing
 from projservo_cli.records import (
@@ -50,7 +51,6 @@ from projservo_cli.task.incidences import incidences_of, nearest_goal, points_of
 from projservo_cli.task.object_bundle_adjustment import Look
 from projservo_cli.task.stand_off import displacement_back
 from projservo_cli.task.target import TaskImages
-from projservo_cli.words import sentence
 
 _GUESSED = 1e-3  # weight of a marker in a fit that is predicted from others
 

@@ -1,6 +1,6 @@
 """Words for what is off in a plan, its motion and its goal."""
 
-from projservo_cli.words.rows import Row
+from projservo_cli.messages.row_form import Row
 
 _OTHER_PROFILE = "choose another trajectory.profile"
 # Constraints of a motion, the one nearest to failing.

@@ -1,6 +1,6 @@
 """Words for what is off in a calibration, its data and its fit."""
 
-from projservo_cli.words.rows import Row
+from projservo_cli.messages.row_form import Row
 
 # Deviations of an arm or a rig from the model, by the score tests.
 _CURVE, _AGAIN = "fit it (--joint-model auto), or mend the joint", "fix what moved, and record again"

@@ -7,11 +7,11 @@ import re
 import numpy as np
 import pytest
 
-from projservo_cli import words
+from projservo_cli import messages
 from projservo_cli.deviations import DEVIATIONS
 from projservo_cli.findings import LIMITS, REFUSES, Finding, Subject, sparse
+from projservo_cli.messages import rows_by_code
 from projservo_cli.records import TOOL, WORLD
-from projservo_cli.words import table
 
 VIEWS = ("left", "right", "top", "far side")
 COUNTED = Finding(
@@ -28,30 +28,30 @@ def finding(code, joint_unit):
     return Finding(code, LIMITS, subject, 0.02, 0.001, 0.5, unit, 1.5, 0.2, (COUNTED, COUNTED, COUNTED))
 
 
-@pytest.mark.parametrize("code", words.ROWS)
+@pytest.mark.parametrize("code", messages.ROWS)
 def test_each_finding_has_words_whatever_the_arm_and_the_cameras(code):
     for mount, count, unit in itertools.product((WORLD, TOOL), (1, 2, 3, 4), ("rad", "m")):
         one = finding(code, unit)
-        setup = table.Setup(mount, VIEWS[:count], 1 if count == 1 else 6)
+        setup = rows_by_code.Setup(mount, VIEWS[:count], 1 if count == 1 else 6)
         if code in DEVIATIONS:
             one = Finding(**vars(one) | {"others": (finding("joint_step", unit), finding("base", unit))})
-        row = words.row(one, setup)
-        for text in (words.line(one, setup), words.limit(one, setup), *row.values()):
+        row = messages.row(one, setup)
+        for text in (messages.line(one, setup), messages.limit(one, setup), *row.values()):
             assert not re.search(r"\{\w*\}|\bnan\b|  |None", text), text
-        line = words.line(one, setup)
+        line = messages.line(one, setup)
         told = line.split(" (or ")[0]
-        if "joint" in code and "{size}" in words.ROWS[code].sentence:
+        if "joint" in code and "{size}" in messages.ROWS[code].sentence:
             assert {"rad": "1.1°", "m": "20 mm"}[unit] in told
         if code == "tool":
             assert ("on the tool" if mount == WORLD else "in the scene") in told
-        if "{joints}" in words.ROWS[code].sentence:
+        if "{joints}" in messages.ROWS[code].sentence:
             assert "joint" in line
 
 
 def test_deviations_name_what_else_explains_the_images():
     one = finding("scale", "rad")
     one = Finding(**vars(one) | {"others": (finding("joint_step", "rad"), finding("base", "rad"))})
-    line = words.line(one, table.Setup())
+    line = messages.line(one, rows_by_code.Setup())
     assert "(or step of joint 2, or motion of the base or the cameras: the images do not tell); fit" in line
     assert line.startswith("joint 2 moves 2 % ± 0.1 % more than it reads")
 
@@ -62,7 +62,7 @@ def test_joints_that_are_alike_share_a_line():
         for i in (1, 2)
     ]
     one = Finding("little_motion", LIMITS, Subject(joints=(4,)), 0.01, limit=0.05, unit="m")
-    together = words.lines([*few, one], table.Setup())
+    together = messages.lines([*few, one], rows_by_code.Setup())
     assert together == (
         "joints 1, 2 and 4 moved only 2.86°, 2.86° and 10 mm: move each at least 11.5°, 22.9° and 50 mm",
     )
@@ -72,14 +72,14 @@ def test_a_refusal_names_its_cause_first_and_a_hint_last():
     cause = Finding("joint_type", REFUSES, Subject(joints=(2,), name="RPR"), unit="m")
     misfit = Finding("misfit", REFUSES, Subject(name="views"), 3.0, limit=0.5, unit="px")
     hint = finding("sag", "rad")
-    text = words.refused([cause, misfit], table.Setup())
+    text = messages.refused([cause, misfit], rows_by_code.Setup())
     assert text.startswith("by the images joint 2 is prismatic, not revolute: check the types of joints, ")
     assert "(RPR would fit); as given, the fit does not describe the data: residuals of 3 px a" in text
     assert text.endswith(
         "are 6 times the 0.5 px that the epipolar geometry shows; check the joint readings, "
         "their units and types, and the marker numbers"
     )
-    assert "; the residuals look as if joint 2 sags" in words.refused([misfit, hint], table.Setup())
+    assert "; the residuals look as if joint 2 sags" in messages.refused([misfit, hint], rows_by_code.Setup())
 
 
 def test_cameras_without_a_marker_are_named_by_their_number():
@@ -91,11 +91,11 @@ def test_cameras_without_a_marker_are_named_by_their_number():
         (VIEWS[:3], VIEWS[:3], "no camera shows a marker"),
     ]:
         one = Finding("unseen_markers", subject=Subject(views=dark))
-        assert words.sentence(one, table.Setup(view=view)) == f"{told} of the calibration"
+        assert messages.sentence(one, rows_by_code.Setup(view=view)) == f"{told} of the calibration"
 
 
 def test_no_two_tables_have_words_for_one_code():
-    assert sum(map(len, table.TABLES)) == len(table.ROWS)
+    assert sum(map(len, rows_by_code.TABLES)) == len(rows_by_code.ROWS)
 
 
 def test_numbers_of_numpy_in_findings_are_stored_as_plain_ones():

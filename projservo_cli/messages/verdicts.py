@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from projservo_cli.words.rows import Row
+from projservo_cli.messages.row_form import Row
 
 
 class Verdict(NamedTuple):

@@ -6,9 +6,9 @@ from collections.abc import Callable, Iterable, Sequence
 import numpy as np
 
 from projservo_cli.findings import NOTE, Finding, Subject
+from projservo_cli.messages.rows_by_code import Setup, row_of
+from projservo_cli.messages.verdicts import because
 from projservo_cli.records import CORNERS, LIMITS_MISSING, TOOL
-from projservo_cli.words.reasons import because
-from projservo_cli.words.table import Setup, row_of
 
 # Digits of what is compared with a limit, which may be close.
 _DIGITS = 6

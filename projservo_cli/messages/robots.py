@@ -1,6 +1,6 @@
 """Words for what is off with a robot, its cameras and a recording."""
 
-from projservo_cli.words.rows import Row
+from projservo_cli.messages.row_form import Row
 
 # A number of a tag or a marker that occurs twice in an image, and servos that are left alone.
 _UNIQUE = "a number must be unique: print another one, or cover the tag that is not on the tool"

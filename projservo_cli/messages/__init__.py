@@ -9,9 +9,9 @@ from itertools import groupby
 
 from projservo_cli.deviations import DEVIATIONS
 from projservo_cli.findings import LIMITS, NOTE, REFUSES, Finding, columns, first, usable
+from projservo_cli.messages.placeholders import Told, quantity
+from projservo_cli.messages.rows_by_code import ROWS, Setup
 from projservo_cli.records import Calibration, CalibrationVerdict, WorkFailed
-from projservo_cli.words.table import ROWS, Setup
-from projservo_cli.words.values import Told, quantity
 
 _SETUP = Setup()
 # Severities as levels of a table on a robot.

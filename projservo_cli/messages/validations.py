@@ -1,6 +1,6 @@
 """Words for predictions held against further images: parts left out, a camera fitted again, two views."""
 
-from projservo_cli.words.rows import Row
+from projservo_cli.messages.row_form import Row
 
 _MORE = "record more poses"
 _CHECK = "check the joint readings and the marker numbers"

@@ -1,6 +1,6 @@
 """Words for what has changed since a calibration, by images of a robot at work."""
 
-from projservo_cli.words.rows import Row
+from projservo_cli.messages.row_form import Row
 
 _OFF = "images are {amount} rms off their prediction by the calibration"
 _PUT_BACK = "put {them} back, or recalibrate"

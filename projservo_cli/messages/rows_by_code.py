@@ -4,13 +4,20 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from projservo_cli.findings import Finding
+from projservo_cli.messages import (
+    calibrations,
+    monitoring,
+    plans,
+    robots,
+    validations,
+    verdicts,
+)
+from projservo_cli.messages.row_form import Row
 from projservo_cli.records import TOOL, VIEWS, WORLD
-from projservo_cli.words import calibrations, monitoring, plans, reasons, robots, validations
-from projservo_cli.words.rows import Row
 
 TABLES = (
     *(calibrations.OF_MODEL, calibrations.CALIBRATION, calibrations.REFUSALS),
-    *(validations.VALIDATIONS, plans.PLANS, monitoring.FAULTS, reasons.REASONS, robots.ROBOTS),
+    *(validations.VALIDATIONS, plans.PLANS, monitoring.FAULTS, verdicts.REASONS, robots.ROBOTS),
 )
 ROWS: dict[str, Row] = {code: row for rows in TABLES for code, row in rows.items()}
 _ON_THE_TOOL = calibrations.ON_THE_TOOL | monitoring.ON_THE_TOOL
