@@ -309,7 +309,7 @@ def _of_suggestions(value: dict[str, Any]) -> Iterator[str]:
 
 
 def _of_plan(value: dict[str, Any], detailed: bool) -> Iterator[str]:
-    from projservo_cli.report.report_data import NEAREST
+    from projservo_cli.report.json_objects import NEAREST
 
     if "plans" in value:
         for plan in value["plans"]:

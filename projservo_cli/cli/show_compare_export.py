@@ -26,7 +26,7 @@ def _show(console: Console, *, run: Path | None, output: Path | None) -> None:
     """
     target = option.one_run("show", run, output) or Path("results", "paper")
     from projservo_cli.config import load_config
-    from projservo_cli.report.report_data import stage_object
+    from projservo_cli.report.json_objects import stage_object
     from projservo_cli.store.run_file import load
 
     found = load(target)

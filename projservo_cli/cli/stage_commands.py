@@ -513,7 +513,7 @@ def _work(console: Console, chain: "Chain", options: Mapping[str, Any]) -> int:
         beside["report"] |= chain.optional_files(wanted)
     beside["report"]["replayed"] = chain.replayed()
     from projservo_cli.records import WorkFailed
-    from projservo_cli.report.report_data import failed_object, stage_object
+    from projservo_cli.report.json_objects import failed_object, stage_object
 
     values, joints = {}, chain.config.joint_names
     for name in chain.names:

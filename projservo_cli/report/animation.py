@@ -16,6 +16,7 @@ from projservo_cli.laws import BODY_LAWS, POINT_LAWS
 from projservo_cli.messages.verdicts import arrived
 from projservo_cli.records import BoolArray, ByteArray, FloatArray, InputError, IntArray, Plan, Trace
 from projservo_cli.report import style
+from projservo_cli.report.figure_inputs import PAGE_FILE, title
 from projservo_cli.report.figures.images import OF_SCENE, OF_TOOL, frames_of, with_halo
 from projservo_cli.report.figures.joint_space import tree_edges, with_gaps
 from projservo_cli.report.figures.scene import (
@@ -27,7 +28,6 @@ from projservo_cli.report.figures.scene import (
     transformed,
 )
 from projservo_cli.report.html import html_page
-from projservo_cli.report.report_data import PAGE_FILE, title
 from projservo_cli.simulation.analytic_plant import Plant
 from projservo_cli.simulation.arm import SerialArm
 from projservo_cli.store.files_and_locks import replacing, write_whole

@@ -15,8 +15,7 @@ from projservo_cli.loop.verdicts import plateau_stretch
 from projservo_cli.messages.placeholders import joined
 from projservo_cli.messages.verdicts import arrived
 from projservo_cli.records import FloatArray, Trace
-from projservo_cli.report.figures.path_deviation import study_numbers
-from projservo_cli.report.report_data import (
+from projservo_cli.report.figure_inputs import (
     DIRECT,
     Composition,
     ReportData,
@@ -25,6 +24,7 @@ from projservo_cli.report.report_data import (
     curve_difference,
     percent,
 )
+from projservo_cli.report.figures.path_deviation import study_numbers
 
 
 class _Claim(NamedTuple):

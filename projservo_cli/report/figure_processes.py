@@ -10,7 +10,7 @@ from threading import Condition, Thread
 from typing import Any, NamedTuple
 
 from projservo_cli.report import style
-from projservo_cli.report.report_data import Data, FigureSpec
+from projservo_cli.report.figure_inputs import Data, FigureSpec
 
 # Processors that figures may be drawn on.
 PROCESSORS = os.cpu_count() or 1

@@ -18,17 +18,11 @@ from projservo_cli.findings import REACH_M, REACH_RAD
 from projservo_cli.laws import must_converge, run_name
 from projservo_cli.messages.verdicts import arrived
 from projservo_cli.records import Plan, Report
+from projservo_cli.report.figure_inputs import ANIMATION_FILE, PAGE_FILE, VIEW_FILE, FigureSpec, title
 from projservo_cli.report.figures import FIGURES
 from projservo_cli.report.figures.path_deviation import drift_rows
 from projservo_cli.report.html import embedded, html_page, short
-from projservo_cli.report.report_data import (
-    ANIMATION_FILE,
-    PAGE_FILE,
-    VIEW_FILE,
-    FigureSpec,
-    stage_object,
-    title,
-)
+from projservo_cli.report.json_objects import stage_object
 from projservo_cli.report.style import FORMATS
 from projservo_cli.store.display import About
 from projservo_cli.store.files_and_locks import lies_inside, write_whole

@@ -29,12 +29,7 @@ from projservo_cli.records import VIEWS, Calibration, FloatArray, Model, Plan, R
 from projservo_cli.report import style
 from projservo_cli.report.animation import motion_of, write_animation, write_view
 from projservo_cli.report.claims import claims_of
-from projservo_cli.report.figure_processes import Drawing, SecondProcess
-from projservo_cli.report.figures import FIGURES
-from projservo_cli.report.figures.path_deviation import drift_rows, study_numbers
-from projservo_cli.report.figures.scene import chosen_poses, metric_rows
-from projservo_cli.report.page import write_page
-from projservo_cli.report.report_data import (
+from projservo_cli.report.figure_inputs import (
     ANIMATION_FILE,
     CLAIMS_FILE,
     DIRECT,
@@ -45,6 +40,11 @@ from projservo_cli.report.report_data import (
     ReportData,
     Studies,
 )
+from projservo_cli.report.figure_processes import Drawing, SecondProcess
+from projservo_cli.report.figures import FIGURES
+from projservo_cli.report.figures.path_deviation import drift_rows, study_numbers
+from projservo_cli.report.figures.scene import chosen_poses, metric_rows
+from projservo_cli.report.page import write_page
 from projservo_cli.simulation.ground_truth import Truth, plant_of
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.carried_goals import in_metres

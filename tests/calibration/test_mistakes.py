@@ -8,7 +8,7 @@ import pytest
 
 from projservo_cli.calibration import calibrate
 from projservo_cli.records import WorkFailed
-from projservo_cli.report.report_data import findings
+from projservo_cli.report.json_objects import findings
 from tests.calibration.bound import errors_of_the_best
 from tests.calibration.mistakes import KINDS, MISTAKES, median_error, shares_left_out, table
 from tests.calibration.simulated_robot import random_robot, trials

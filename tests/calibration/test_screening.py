@@ -8,7 +8,7 @@ import pytest
 from projservo_cli import Observations, calibrate
 from projservo_cli.calibration import residual_statistics
 from projservo_cli.records import Calibration, Observation, flat_fields
-from projservo_cli.report.report_data import findings
+from projservo_cli.report.json_objects import findings
 from tests.calibration.simulated_robot import around, random_robot, trials
 
 ROBOT = random_robot("RRR", np.random.default_rng(1), markers=8)

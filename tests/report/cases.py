@@ -9,8 +9,8 @@ from projservo_cli.calibration.prediction import Parameters
 from projservo_cli.config.inputs import report_inputs
 from projservo_cli.laws import LAW_SPECS, run_name
 from projservo_cli.records import Calibration
+from projservo_cli.report.figure_inputs import ReportData
 from projservo_cli.report.figures import FIGURES
-from projservo_cli.report.report_data import ReportData
 from projservo_cli.robots.frame_recorder import FrameRecorder
 from projservo_cli.stages import report as stage
 from projservo_cli.stages.carried_goals import in_metres

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from projservo_cli.report.report_data import PAGE_FILE
+from projservo_cli.report.figure_inputs import PAGE_FILE
 from tests.configured import compared, view_of
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")

@@ -8,7 +8,7 @@ from projservo_cli.calibration.prediction import parameters_from
 from projservo_cli.chain.outdated import steps_for
 from projservo_cli.config import load_config, to_yaml
 from projservo_cli.records import Observation, changed
-from projservo_cli.report.report_data import Fit
+from projservo_cli.report.figure_inputs import Fit
 from projservo_cli.robots.frame_recorder import FrameRecorder
 from projservo_cli.store.run_file import Result, Run
 from tests.configured import report_on

@@ -3,8 +3,8 @@ import pytest
 
 from projservo_cli.geometry.displacements import exp_rotation
 from projservo_cli.geometry.kinematics import project
+from projservo_cli.report.figure_inputs import along_line
 from projservo_cli.report.figures.path_deviation import study_numbers
-from projservo_cli.report.report_data import along_line
 from projservo_cli.task.trajectory import trajectory_displacement
 from tests.report.cases import GAINS, SPECS, case
 

@@ -6,8 +6,8 @@ from scipy.stats import chi2
 
 from projservo_cli.config.inputs import report_inputs
 from projservo_cli.metric.frame import links
+from projservo_cli.report.figure_inputs import Fit
 from projservo_cli.report.figures.scene import chosen_poses, metric_rows
-from projservo_cli.report.report_data import Fit
 from projservo_cli.stages.carried_goals import in_metres
 from tests.configured import calibrate, truth_of
 from tests.known import configured

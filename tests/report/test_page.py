@@ -13,7 +13,8 @@ from projservo_cli.config import load_config, to_yaml
 from projservo_cli.records import CrossValidation, changed
 from projservo_cli.report.animation import write_animation
 from projservo_cli.report.claims import claims_of
-from projservo_cli.report.report_data import PAGE_FILE, stage_object
+from projservo_cli.report.figure_inputs import PAGE_FILE
+from projservo_cli.report.json_objects import stage_object
 from projservo_cli.store.observation_tables import to_csv
 from projservo_cli.store.run_file import Result
 from tests.configured import compared, page_of

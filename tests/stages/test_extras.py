@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from projservo_cli.report import animation as film
-from projservo_cli.report.report_data import ANIMATION_FILE, PAGE_FILE, VIEW_FILE
+from projservo_cli.report.figure_inputs import ANIMATION_FILE, PAGE_FILE, VIEW_FILE
 from projservo_cli.stages import report
 from projservo_cli.store.run_file import Result
 from tests.configured import animation_of, page_of, report_on, view_of

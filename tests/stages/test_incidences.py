@@ -9,8 +9,8 @@ import pytest
 from projservo_cli.findings import REFUSES, Finding
 from projservo_cli.records import InputError, WorkFailed, changed
 from projservo_cli.report.animation import motion_of
+from projservo_cli.report.figure_inputs import REGISTER, Driven
 from projservo_cli.report.figures.scene import features_in_space
-from projservo_cli.report.report_data import REGISTER, Driven
 from projservo_cli.simulation.ground_truth import plant_of
 from projservo_cli.stages.runs.plugin_law import PluginLaw
 from projservo_cli.stages.runs.run_trace import trace_of

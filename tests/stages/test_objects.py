@@ -9,7 +9,7 @@ import pytest
 
 from projservo_cli.config.inputs import servo_inputs
 from projservo_cli.records import InputError, WorkFailed
-from projservo_cli.report.report_data import REGISTER, Driven
+from projservo_cli.report.figure_inputs import REGISTER, Driven
 from projservo_cli.stages.bench import Case
 from projservo_cli.stages.scenario import run_scenario
 from tests.configured import calibrate, plan, servo, truth_of

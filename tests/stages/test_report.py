@@ -9,8 +9,8 @@ from projservo_cli.control.law import Gains
 from projservo_cli.geometry.displacements import screws, twists
 from projservo_cli.records import changed
 from projservo_cli.report.claims import claims_of
+from projservo_cli.report.figure_inputs import Composition
 from projservo_cli.report.figures.path_deviation import study_numbers
-from projservo_cli.report.report_data import Composition
 from projservo_cli.stages import report
 from projservo_cli.stages.report import run_studies
 from projservo_cli.store.run_file import Result, load, save

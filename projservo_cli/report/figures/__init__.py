@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from projservo_cli.records import Calibration, CrossValidation, Observation, Plan, Trace, position_limits
+from projservo_cli.report.figure_inputs import REGISTER, Fit, title
 from projservo_cli.report.figures import scene
-from projservo_cli.report.report_data import REGISTER, Fit, title
 from projservo_cli.task.face import cyclic_order
 
 if TYPE_CHECKING:

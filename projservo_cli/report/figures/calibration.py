@@ -18,7 +18,7 @@ from projservo_cli.calibration.prediction import (
 )
 from projservo_cli.records import BoolArray, Calibration, FloatArray, IntArray, Observation
 from projservo_cli.report import panels, style
-from projservo_cli.report.report_data import Data, Fit, registered
+from projservo_cli.report.figure_inputs import Data, Fit, registered
 
 _ARROW = 0.04  # length of an arrow of the rms residual, as a fraction of the extent of the observations
 _BAND = (0.025, 0.975)  # shares of χ² between which the residuals of a pose are expected

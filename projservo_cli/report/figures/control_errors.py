@@ -5,7 +5,7 @@ import numpy as np
 from projservo_cli.laws import PAPER_LAWS
 from projservo_cli.records import FloatArray, Trace
 from projservo_cli.report import panels, style
-from projservo_cli.report.report_data import (
+from projservo_cli.report.figure_inputs import (
     Data,
     Driven,
     ReportData,

@@ -11,7 +11,7 @@ from projservo_cli.laws import BODY_LAWS, PAPER_LAWS, POINT_LAWS, title_of
 from projservo_cli.loop.verdicts import plateau_stretches
 from projservo_cli.records import CORNERS, ByteArray, FloatArray, IncidenceHistory, IntArray, Trace
 from projservo_cli.report import panels, style
-from projservo_cli.report.report_data import DIRECT, Data, Driven, ReportData, percent, registered, title
+from projservo_cli.report.figure_inputs import DIRECT, Data, Driven, ReportData, percent, registered, title
 from projservo_cli.task.face import cyclic_order
 
 # Classical laws of the paper; those of others are among every run.

@@ -9,7 +9,7 @@ from projservo_cli.geometry.kinematics import forward_kinematics, project
 from projservo_cli.image_size import BEHIND
 from projservo_cli.records import FloatArray, Plan
 from projservo_cli.report import panels, style
-from projservo_cli.report.report_data import Data, ReportData, joint_kinds, joint_units, registered
+from projservo_cli.report.figure_inputs import Data, ReportData, joint_kinds, joint_units, registered
 
 PIECES = 4  # of each edge of a tree, which is no straight line in an image
 _IMAGES_WIDTH, _ROW = 5.8, 1.5  # inches: of all images, and the height of a row of curves

@@ -10,7 +10,15 @@ from projservo_cli.laws import title_of
 from projservo_cli.messages.verdicts import arrived
 from projservo_cli.records import FloatArray, Report, Trace
 from projservo_cli.report import style
-from projservo_cli.report.report_data import DIRECT, Data, ReportData, Studies, along_line, registered, title
+from projservo_cli.report.figure_inputs import (
+    DIRECT,
+    Data,
+    ReportData,
+    Studies,
+    along_line,
+    registered,
+    title,
+)
 
 _PATH_POINTS = 400
 _WHIRL = np.pi  # with a longer joint step, rad or m, the arm winds up: its path is drawn at the instants only

@@ -15,7 +15,7 @@ from projservo_cli.image_size import image_corners
 from projservo_cli.metric.frame import Metric, links
 from projservo_cli.records import MM, TOOL, BoolArray, FloatArray, Trace, WorkFailed
 from projservo_cli.report import style
-from projservo_cli.report.report_data import Data, Fit, ReportData, registered
+from projservo_cli.report.figure_inputs import Data, Fit, ReportData, registered
 from projservo_cli.simulation.analytic_plant import Plant
 from projservo_cli.simulation.arm import SerialArm, camera_center, roll_axis
 from projservo_cli.task.face import center_of

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from projservo_cli.report import style
-from projservo_cli.report.report_data import Data
+from projservo_cli.report.figure_inputs import Data
 from projservo_cli.store.sweep_table import SweepTable
 
 _LAW = "law"  # column

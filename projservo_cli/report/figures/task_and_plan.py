@@ -12,7 +12,7 @@ from projservo_cli.geometry.stereo import triangulate_points
 from projservo_cli.image_size import border_distance
 from projservo_cli.records import FloatArray, WorkFailed
 from projservo_cli.report import panels, style
-from projservo_cli.report.report_data import Data, ReportData, registered
+from projservo_cli.report.figure_inputs import Data, ReportData, registered
 from projservo_cli.simulation.arm import METRIC_A_INF, roll_axis
 from projservo_cli.task.face import cyclic_order
 from projservo_cli.task.trajectory import trajectory_displacement
