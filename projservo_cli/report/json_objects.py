@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import fields
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -11,18 +11,9 @@ from projservo_cli.calibration.joint_model import describe_curve
 from projservo_cli.findings import REFUSES, Finding, named, of_readings, told
 from projservo_cli.messages import line, sentence, setup_of
 from projservo_cli.planning.motion_margins import CONSTRAINTS, OF_MOTION
-from projservo_cli.records import (
-    WHY_LOST,
-    Calibration,
-    CarriedByObject,
-    Trace,
-    scalars_of,
-)
+from projservo_cli.records import WHY_LOST, Calibration, CarriedByObject, Trace, scalars_of
 from projservo_cli.report.figure_inputs import PAGE_FILE
 from projservo_cli.store.run_file import Run
-
-if TYPE_CHECKING:
-    pass
 
 # Names of the constraints whose smallest values along the planned motion are told.
 NEAREST = tuple(CONSTRAINTS[constraint].value for constraint in OF_MOTION)

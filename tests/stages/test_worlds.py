@@ -43,12 +43,12 @@ def test_a_world_as_calibrated_holds_no_truth(name):
     "name",
     [
         "plan",
-        "motions",
+        "plan_motion",
         "carried_goals",
         "servo",
         "runs/law_run",
         "runs/run_trace",
-        "runs/driven_robot",
+        "runs/robot_with_monitors",
         "worlds/calibrated",
     ],
 )
