@@ -16,13 +16,14 @@ from projservo_cli.config.loading import Config, stored_yaml
 from projservo_cli.config.settings_and_rules import carriers_of, truth_of
 from projservo_cli.records import ANGLE, MEET, PARALLEL, PERPENDICULAR, TOOL, InputError
 from projservo_cli.result_hashes import File
-from projservo_cli.settings.control import LawSettings, Rest, RunConditions, ServoLimits, SpeedLimits
+from projservo_cli.settings.control import LawSettings, SpeedLimits
 from projservo_cli.settings.disturbance import Disturbance, Events, Faults
 from projservo_cli.settings.features import Feature, Pair
 from projservo_cli.settings.markers import Markers
+from projservo_cli.settings.noise_and_data import LoopNoise
 from projservo_cli.settings.objects import ObjectSettings
+from projservo_cli.settings.plant import Rest, RunConditions, ServoLimits
 from projservo_cli.settings.task import Goal as GoalSettings
-from projservo_cli.settings.trials import LoopNoise
 from projservo_cli.simulation.faults import SimulatedRobot
 from projservo_cli.simulation.from_settings import (
     arm_of,

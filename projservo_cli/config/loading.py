@@ -25,7 +25,7 @@ from projservo_cli.config.settings_and_rules import Settings, truth_of
 from projservo_cli.config.sweep import SweepConfig
 from projservo_cli.passwords import masked
 from projservo_cli.records import FloatArray, InputError
-from projservo_cli.settings.control import RENDERED, RenderedOptions
+from projservo_cli.settings.plant import RENDERED, RenderedOptions
 from projservo_cli.settings.sections import CONTRADICTIONS, Note, Section
 from projservo_cli.settings.task import CURRENT
 from projservo_cli.simulation.from_settings import arm_of

@@ -12,16 +12,19 @@ from pydantic import AfterValidator, Field, StringConstraints
 from projservo_cli.image_size import ImageSize
 from projservo_cli.laws import REGULATE
 from projservo_cli.records import LIMITS_MISSING, TOOL, WORLD, InputError, in_unit
+from projservo_cli.settings.calibration import CalibrationSettings
 from projservo_cli.settings.cameras import Cameras
-from projservo_cli.settings.control import RENDERED, Control, PlantSettings, ReportSettings, Stop
+from projservo_cli.settings.control import Control
 from projservo_cli.settings.disturbance import Disturbance
 from projservo_cli.settings.features import Feature, Name, misplaced
 from projservo_cli.settings.markers import Markers
+from projservo_cli.settings.noise_and_data import Data, Noise
 from projservo_cli.settings.objects import WORLD_AND_TOOL, Objects
-from projservo_cli.settings.robot import Rig, RobotSettings, like_degrees
+from projservo_cli.settings.plant import RENDERED, PlantSettings
+from projservo_cli.settings.robot_and_rig import Rig, RobotSettings, like_degrees
 from projservo_cli.settings.sections import JointVector, Note, Root, Whole
+from projservo_cli.settings.stop_and_report import ReportSettings, Stop
 from projservo_cli.settings.task import Goal, GoalImages, TaskSettings, TaskStep, Trajectory, sigma_key
-from projservo_cli.settings.trials import CalibrationSettings, Data, Noise
 from projservo_cli.simulation.from_settings import described_truth
 from projservo_cli.simulation.ground_truth import Truth
 from projservo_cli.simulation.random_streams import NORMAL, NoiseShape

@@ -8,7 +8,8 @@ from typing import Annotated, Any
 from pydantic import BeforeValidator, Field
 
 from projservo_cli.config.settings_and_rules import FolderName
-from projservo_cli.settings.control import Plain, one_or_more
+from projservo_cli.settings.control import one_or_more
+from projservo_cli.settings.plant import Plain
 from projservo_cli.settings.sections import Count, Note, Number, OneOf, Positive, Root, Section, Whole
 
 BASE, LAW = "base", "law"  # names of axes with a special meaning

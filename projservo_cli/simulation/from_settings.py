@@ -14,9 +14,9 @@ from projservo_cli.geometry.displacements import twists
 from projservo_cli.image_size import image_sizes
 from projservo_cli.records import TOOL, FloatArray, no_lenses, position_limits, prismatic_of
 from projservo_cli.result_hashes import File
-from projservo_cli.settings.control import RenderedOptions
 from projservo_cli.settings.markers import Markers, Tag
-from projservo_cli.settings.robot import Camera, Rig, RobotSettings
+from projservo_cli.settings.plant import RenderedOptions
+from projservo_cli.settings.robot_and_rig import Camera, Rig, RobotSettings
 from projservo_cli.simulation.arm import Link, SerialArm, dh_twists
 from projservo_cli.simulation.ground_truth import Truth
 from projservo_cli.simulation.random_streams import NoiseShape

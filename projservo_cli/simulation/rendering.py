@@ -16,8 +16,8 @@ from projservo_cli.detection import TagFinder
 from projservo_cli.geometry.lens import undistort
 from projservo_cli.records import CORNERS, VIEWS, ByteArray, FloatArray, InputError, IntArray
 from projservo_cli.result_hashes import File
-from projservo_cli.settings.control import RenderedOptions
 from projservo_cli.settings.markers import Tag
+from projservo_cli.settings.plant import RenderedOptions
 from projservo_cli.simulation.arm import SerialArm, roll_axis
 from projservo_cli.simulation.mjcf import chain_of, compiled, mujoco, no_gl, spec_of, tip_of
 

@@ -13,22 +13,16 @@ from projservo_cli.result_hashes import File, digest, encoded
 from projservo_cli.robots.contract import Bounds
 from projservo_cli.robots.joint_limits import Joints
 from projservo_cli.settings.cameras import Cameras
-from projservo_cli.settings.control import (
-    LawSettings,
-    ReportSettings,
-    Rest,
-    RunConditions,
-    ServoLimits,
-    SpeedLimits,
-    Stop,
-)
+from projservo_cli.settings.control import LawSettings, SpeedLimits
 from projservo_cli.settings.disturbance import EachView, Events
 from projservo_cli.settings.markers import Markers
+from projservo_cli.settings.noise_and_data import LoopNoise
 from projservo_cli.settings.objects import Objects
-from projservo_cli.settings.robot import LimitSettings
+from projservo_cli.settings.plant import Rest, RunConditions, ServoLimits
+from projservo_cli.settings.robot_and_rig import LimitSettings
 from projservo_cli.settings.sections import JointVector
+from projservo_cli.settings.stop_and_report import ReportSettings, Stop
 from projservo_cli.settings.task import GoalImages, TaskSettings, Trajectory
-from projservo_cli.settings.trials import LoopNoise
 from projservo_cli.simulation.arm import SerialArm
 from projservo_cli.simulation.faults import SimulatedRobot
 from projservo_cli.simulation.ground_truth import SceneObject, Truth

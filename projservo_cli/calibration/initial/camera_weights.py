@@ -4,9 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from projservo_cli.calibration.detections import (
-    RAYLEIGH,
-)
+from projservo_cli.calibration.detections import RAYLEIGH
 from projservo_cli.calibration.initial.epipolar import Epipolar, ImageGeometry
 from projservo_cli.calibration.lens_estimation import undistorted
 from projservo_cli.calibration.robust_fit import Solution, fit_inliers
