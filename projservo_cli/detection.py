@@ -538,7 +538,7 @@ class Finder(ABC):
         if image is None:
             raise InputError(f"{path}: not an image that OpenCV can read; save it again, as PNG for example")
         if wrong := unfit(image):
-            raise InputError(f"{path}: {messages.line(wrong)}")
+            raise InputError(f"{path}: {messages.sentence_and_remedy(wrong)}")
         if image.ndim > 2:
             flags = self.cv.IMREAD_GRAYSCALE | self.cv.IMREAD_IGNORE_ORIENTATION
             image = self.cv.imdecode(content, flags)

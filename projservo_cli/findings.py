@@ -55,7 +55,7 @@ class Finding:
         return dict.fromkeys(values) | known | {"subject": subject}
 
 
-def told(text: str, severity: str = LIMITS) -> Finding:
+def from_text(text: str, severity: str = LIMITS) -> Finding:
     """Return a finding on what somebody else says in words: another version, a robot class, an error."""
     return Finding("told", severity, Subject(name=text))
 
@@ -92,7 +92,7 @@ def of_readings(one: Finding) -> tuple[float, float]:
     return one.amount / per, one.deviation / per
 
 
-def columns(findings: Iterable[Finding]) -> dict[str, Any]:
+def to_columns(findings: Iterable[Finding]) -> dict[str, Any]:
     """Return the deviations from the model as the columns of a run file, and the one that is not shown."""
     shown = [one for one in findings if one.code in DEVIATIONS]
     hidden = [other for one in findings if one.code == "unshown" for other in one.others]
@@ -114,7 +114,7 @@ def _numbers(one: Finding) -> tuple[float, ...]:
     return (*of_readings(one), one.effect_px, *(one.subject.poses or (math.nan,)))
 
 
-def of_columns(name: str, numbers: Iterable[float], units: Sequence[str]) -> Finding:
+def from_columns(name: str, numbers: Iterable[float], units: Sequence[str]) -> Finding:
     """Return a deviation from its columns in a run file; units : of the joints, rad or m."""
     one, *others = (_parsed(word, units) for word in name.split("/"))
     estimate, deviation, effect, pose = map(float, numbers)

@@ -16,7 +16,7 @@ from projservo_cli.records import FloatArray, Model, position_limits
 from projservo_cli.simulation.analytic_plant import Plant
 from projservo_cli.task.body_pose import make_body
 from projservo_cli.task.face import MIDPOINT, Task, center_of, cyclic_order, face_plane
-from projservo_cli.task.target import Goal, TaskImages
+from projservo_cli.task.target import TargetGoal, TaskImages
 from tests.samples import METRIC_A_INF, arm, face, in_frame, pixels, poe
 
 # Laws that measure a face point by point; that of incidences takes a body.
@@ -42,7 +42,7 @@ class Scene(NamedTuple):
 
     def task(self, G=None) -> Task:
         """Task in the frame of the model ``self.seen(G)``."""
-        return TaskImages(self.q_start, self.s_start, Goal.at(self.s_star), self.plant.center).task(
+        return TaskImages(self.q_start, self.s_start, TargetGoal.at(self.s_star), self.plant.center).task(
             self.seen(G)
         )
 
@@ -60,7 +60,7 @@ class Scene(NamedTuple):
             distort(lens, pixels(self.model.P, M @ poe(self.model, q).T)) for q in (self.q_start, self.q_goal)
         ]
         return TaskImages(
-            self.q_start, s[0], Goal.at(s[1]), self.plant.center, len(self.plant.pins), body
+            self.q_start, s[0], TargetGoal.at(s[1]), self.plant.center, len(self.plant.pins), body
         ).task(model)
 
     def images(self, q) -> FloatArray:

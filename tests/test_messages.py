@@ -35,10 +35,10 @@ def test_each_finding_has_words_whatever_the_arm_and_the_cameras(code):
         setup = rows_by_code.Setup(mount, VIEWS[:count], 1 if count == 1 else 6)
         if code in DEVIATIONS:
             one = Finding(**vars(one) | {"others": (finding("joint_step", unit), finding("base", unit))})
-        row = messages.row(one, setup)
-        for text in (messages.line(one, setup), messages.limit(one, setup), *row.values()):
+        row = messages.table_row(one, setup)
+        for text in (messages.sentence_and_remedy(one, setup), messages.limit(one, setup), *row.values()):
             assert not re.search(r"\{\w*\}|\bnan\b|  |None", text), text
-        line = messages.line(one, setup)
+        line = messages.sentence_and_remedy(one, setup)
         told = line.split(" (or ")[0]
         if "joint" in code and "{size}" in messages.ROWS[code].sentence:
             assert {"rad": "1.1°", "m": "20 mm"}[unit] in told
@@ -51,7 +51,7 @@ def test_each_finding_has_words_whatever_the_arm_and_the_cameras(code):
 def test_deviations_name_what_else_explains_the_images():
     one = finding("scale", "rad")
     one = Finding(**vars(one) | {"others": (finding("joint_step", "rad"), finding("base", "rad"))})
-    line = messages.line(one, rows_by_code.Setup())
+    line = messages.sentence_and_remedy(one, rows_by_code.Setup())
     assert "(or step of joint 2, or motion of the base or the cameras: the images do not tell); fit" in line
     assert line.startswith("joint 2 moves 2 % ± 0.1 % more than it reads")
 

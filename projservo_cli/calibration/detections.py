@@ -550,7 +550,7 @@ def _require_no_line(detections: Detections, sigma: float) -> None:
         raise WorkFailed(ON_A_LINE)
 
 
-def deviation(residual: FloatArray, floor: float) -> float:
+def robust_deviation(residual: FloatArray, floor: float) -> float:
     """Robust standard deviation of residuals about zero, at least ``floor``."""
     return max(float(np.median(np.abs(residual))) / MAD, floor)
 

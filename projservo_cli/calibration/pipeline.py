@@ -13,7 +13,11 @@ from threadpoolctl import threadpool_limits
 from projservo_cli.calibration.bundle_adjustment import LeastSquares
 from projservo_cli.calibration.checks.image_contradictions import checked_geometry
 from projservo_cli.calibration.checks.joint_order import require_poses
-from projservo_cli.calibration.checks.markers_not_on_tool import standing, standing_markers, without_strange
+from projservo_cli.calibration.checks.markers_not_on_tool import (
+    motionless,
+    motionless_finding,
+    without_strange,
+)
 from projservo_cli.calibration.checks.mislabelled_data import relabelled
 from projservo_cli.calibration.checks.mismatched_poses import on_shown_poses
 from projservo_cli.calibration.checks.model_errors import ModelCheck
@@ -28,7 +32,7 @@ from projservo_cli.calibration.checks.unusable_fit import (
     DOUBTED_RATIO,
     MUCH,
     contradiction,
-    deviation,
+    main_deviation,
     other_motion,
     refusal,
     straight_joints,
@@ -61,7 +65,7 @@ from projservo_cli.calibration.robust_fit import (
     solve,
 )
 from projservo_cli.calibration.time_offset import with_time_offset
-from projservo_cli.findings import LIMITS, REFUSES, Finding, Subject, columns
+from projservo_cli.findings import LIMITS, REFUSES, Finding, Subject, to_columns
 from projservo_cli.geometry.lens import K1
 from projservo_cli.image_size import ImageSize, border_distance, image_sizes
 from projservo_cli.messages import judged, with_findings
@@ -185,8 +189,8 @@ def calibrate(
     # The matrices are small: a second thread costs more than it gives.
     with threadpool_limits(limits=1):
         whole = Detections.of(observation, joint_types, mount)
-        still = standing(whole)
-        of_still, numbers = [standing_markers(whole, still)] if still.any() else [], whole.marker[still]
+        still = motionless(whole)
+        of_still, numbers = [motionless_finding(whole, still)] if still.any() else [], whole.marker[still]
         whole = whole.of_markers(~still)
         require_motion(whole)
         require_no_copies(whole)
@@ -349,7 +353,7 @@ def _refined(
                     filter(None, [other_motion(solution, found, epipolar) or doubt or why]), detections
                 )
     except Misfit as refused:
-        hint = deviation(solution, expected) if share < _DECISIVE_SHARE else of_lens
+        hint = main_deviation(solution, expected) if share < _DECISIVE_SHARE else of_lens
         by_joints = refused.findings[0].code in ("several_joints", "erring_joint")  # nothing else moved
         if hint is None or (by_joints and not hint.subject.joints):
             raise
@@ -438,7 +442,7 @@ def _record(
         stated=StatedErrors(
             predicted_rms_px=verdict.error[0],
             predicted_p99_px=verdict.error[1],
-            **columns(about_all.findings),
+            **to_columns(about_all.findings),
             **({} if check is None else _model_fields(result, solution, check)),
         ),
     )

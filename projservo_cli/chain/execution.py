@@ -18,7 +18,7 @@ from projservo_cli.config.inputs import about_of, scenery_of, suggestion_inputs
 from projservo_cli.findings import Finding
 from projservo_cli.laws import CODES, POINT_LAWS, codes_of, law_and_mode, must_converge, run_name
 from projservo_cli.loop.jit_notice import compilation
-from projservo_cli.messages import failed, line
+from projservo_cli.messages import failed, sentence_and_remedy
 from projservo_cli.messages.verdicts import arrived, meaning
 from projservo_cli.records import InputError, Plan, WorkFailed
 from projservo_cli.result_hashes import digest
@@ -197,7 +197,7 @@ class Chain:
                 if not self.confirm:
                     self._fail(motion, failed([far]))
                     return False
-                self.listener.say(line(far))
+                self.listener.say(sentence_and_remedy(far))
         if self.confirm:
             if self.config.steps:
                 self.listener.say(f"servo: one after the other: {', '.join(self.config.steps)}")

@@ -111,7 +111,7 @@ def _servos(console: Console, config: str, text: str, *, whole: bool = True) -> 
     from projservo_cli import plugins
     from projservo_cli.config.editing import named_plant
     from projservo_cli.hardware.so101 import SO101, connected, torque_reported
-    from projservo_cli.messages import line
+    from projservo_cli.messages import sentence_and_remedy
     from projservo_cli.records import InputError
 
     use, options = named_plant(text, config)
@@ -122,7 +122,7 @@ def _servos(console: Console, config: str, text: str, *, whole: bool = True) -> 
         try:
             yield servos
         finally:
-            console.say(line(torque_reported(servos)[0]))
+            console.say(sentence_and_remedy(torque_reported(servos)[0]))
 
 
 def _entered(console: Console, what: str) -> Callable[[], bool]:

@@ -199,7 +199,7 @@ def _in_metres(
     from projservo_cli.config.inputs import joints_of
     from projservo_cli.messages import failed, sentence
     from projservo_cli.metric.frame import MetricParameters
-    from projservo_cli.metric.nominal_comparison import contradictions, errors_found
+    from projservo_cli.metric.nominal_comparison import errors_found, length_contradictions
     from projservo_cli.metric.opencv import opencv_cameras
     from projservo_cli.records import TOOL
     from projservo_cli.results import ImageModel
@@ -214,13 +214,13 @@ def _in_metres(
         words.append(
             f"known length {length_m:g} m ± ? (--metric-std): deviations of lengths leave its own out"
         )
-    wrong = tuple(contradictions(metric, None, measured=std is not None))
+    wrong = tuple(length_contradictions(metric, None, measured=std is not None))
     if model is not None and not wrong:
         errors = metric.errors_of(*model[:2])
         value["nominal"] = [error._asdict() for error in errors.joints]
         value |= {"length_error": errors.length, "length_error_std": errors.length_std}
         words += map(sentence, errors_found(errors, metric.joint_types))
-        wrong = tuple(contradictions(metric, errors, measured=std is not None))
+        wrong = tuple(length_contradictions(metric, errors, measured=std is not None))
     if wrong:
         raise failed(wrong, stage="export")
     if model is not None and model[2]:

@@ -62,7 +62,7 @@ def _teach(
     """
     from projservo_cli.config import plain_yaml
     from projservo_cli.config.inputs import plan_inputs, teach_inputs
-    from projservo_cli.messages import line
+    from projservo_cli.messages import sentence_and_remedy
     from projservo_cli.messages.placeholders import sharing
     from projservo_cli.messages.rows_by_code import Setup
     from projservo_cli.records import InputError, WorkFailed
@@ -118,7 +118,7 @@ def _teach(
             f"{sharing(taught.view)} all tags, and teach again with --force"
         )
     if hidden:
-        console.say(f"teach: {line(hidden, Setup(view=taught.view))}")
+        console.say(f"teach: {sentence_and_remedy(hidden, Setup(view=taught.view))}")
     if check is not None and not check.reached:
         raise WorkFailed(f"{output}: by the calibration, {check.reason}", findings=check.findings)
 

@@ -19,9 +19,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from projservo_cli.findings import LIMITS, REFUSES, Finding, Subject, told
+from projservo_cli.findings import LIMITS, REFUSES, Finding, Subject, from_text
 from projservo_cli.hardware.feetech import FeetechBus, PortLost, ServoSilent
-from projservo_cli.messages import failed, line
+from projservo_cli.messages import failed, sentence_and_remedy
 from projservo_cli.messages.placeholders import servo_name
 from projservo_cli.records import FloatArray, InputError, JointLimits, WorkFailed
 
@@ -198,7 +198,7 @@ class Servos:
 
     def failure(self, error: WorkFailed) -> Finding:
         """Tell which joints may fall where the bus fails; nothing more is written to them."""
-        lost = told(str(error), REFUSES)
+        lost = from_text(str(error), REFUSES)
         if not isinstance(error, ServoSilent):
             return replace(lost, code="lost_port")
         silent = tuple(map(self.finding, error.silent))
@@ -392,7 +392,7 @@ class SO101:
         if self._opened:
             self._opened = False
             torque, all_answer = torque_reported(self._servos)
-            _say(line(torque))
+            _say(sentence_and_remedy(torque))
             self._servos.bus.close()
             self._lease.end(moves=self._on and not all_answer)
 

@@ -23,7 +23,7 @@ from numba.experimental import structref
 
 from projservo_cli.control import command, make_law
 from projservo_cli.control.law import ERRORS, OK, Gains, Law, State, new_state
-from projservo_cli.findings import REFUSES, Finding, told
+from projservo_cli.findings import REFUSES, Finding, from_text
 from projservo_cli.geometry.jit import COMPILED, njit
 from projservo_cli.geometry.mechanisms import make_span
 from projservo_cli.loop.verdicts import (
@@ -282,7 +282,7 @@ def run_in_python(
             except WorkFailed as error:
                 if k == 0:
                     raise
-                verdict, plant.disturbance = FAILED, told(str(error), REFUSES)
+                verdict, plant.disturbance = FAILED, from_text(str(error), REFUSES)
             except KeyboardInterrupt:
                 if k == 0:
                     raise

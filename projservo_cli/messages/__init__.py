@@ -8,7 +8,7 @@ from dataclasses import replace
 from itertools import groupby
 
 from projservo_cli.deviations import DEVIATIONS
-from projservo_cli.findings import LIMITS, NOTE, REFUSES, Finding, columns, first, usable
+from projservo_cli.findings import LIMITS, NOTE, REFUSES, Finding, first, to_columns, usable
 from projservo_cli.messages.placeholders import Told, quantity
 from projservo_cli.messages.rows_by_code import ROWS, Setup
 from projservo_cli.records import Calibration, CalibrationVerdict, WorkFailed
@@ -39,7 +39,7 @@ def sentence(one: Finding, setup: Setup = _SETUP) -> str:
     return _sentence([one], setup)
 
 
-def line(one: Finding, setup: Setup = _SETUP) -> str:
+def sentence_and_remedy(one: Finding, setup: Setup = _SETUP) -> str:
     """Return the sentence on a finding and its remedy."""
     return _line([one], setup)
 
@@ -50,7 +50,7 @@ def lines(findings: Iterable[Finding], setup: Setup = _SETUP) -> tuple[str, ...]
     return tuple(_line(list(group), setup) for _, group in groups)
 
 
-def row(one: Finding, setup: Setup) -> dict[str, str]:
+def table_row(one: Finding, setup: Setup) -> dict[str, str]:
     """Return a finding as a row of a table: its level, what it is about, what is found, and the remedy."""
     told = Told([one], setup)
     where, remedy = told.text("where") or "robot and cameras", told.text("remedy")
@@ -104,12 +104,12 @@ def refused(findings: Sequence[Finding], setup: Setup) -> str:
     """Return why data make no calibration: a cause that would explain them, the misfit, and a hint."""
     told, words = list(findings), ""
     while told and told[0].code in _CAUSES and len(told) > 1:
-        words += f"{line(told.pop(0), setup)}; as given, "
+        words += f"{sentence_and_remedy(told.pop(0), setup)}; as given, "
     main, *hints = told
-    words += sentence(main, setup) if hints and main.code == "misfit" else line(main, setup)
+    words += sentence(main, setup) if hints and main.code == "misfit" else sentence_and_remedy(main, setup)
     for hint in hints:
         look = f"the residuals look as if {sentence(hint, setup)}"
-        words += f"; {look if hint.code in DEVIATIONS else line(hint, setup)}"
+        words += f"; {look if hint.code in DEVIATIONS else sentence_and_remedy(hint, setup)}"
     return words
 
 
@@ -134,13 +134,13 @@ def with_findings(
     about, *rest = calibration.findings
     verdict = judged((about, *ahead, *rest, *more), setup_of(calibration))
     return replace(
-        calibration, verdict=verdict, stated=replace(calibration.stated, **columns(verdict.findings))
+        calibration, verdict=verdict, stated=replace(calibration.stated, **to_columns(verdict.findings))
     )
 
 
 def order_advice(calibration: Calibration) -> str:
     """Return the line on joints whose order nothing shows; empty if there are none, or it was not tested."""
-    return "".join(line(one, setup_of(calibration)) for one in calibration.open_order)
+    return "".join(sentence_and_remedy(one, setup_of(calibration)) for one in calibration.open_order)
 
 
 def setup_of(calibration: Calibration) -> Setup:

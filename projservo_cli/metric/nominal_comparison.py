@@ -329,7 +329,9 @@ _UNMEASURED, _ROUNDING = 0.0025, 1e-9
 _FARTHEST = 20.0
 
 
-def contradictions(metric: Metric, errors: KinematicErrors | None, *, measured: bool) -> Iterator[Finding]:
+def length_contradictions(
+    metric: Metric, errors: KinematicErrors | None, *, measured: bool
+) -> Iterator[Finding]:
     """Yield what contradicts the known length: far cameras, readings of prismatic joints, links of a model.
 
     measured : whether the deviation of the length is known; otherwise one per cent passes.

@@ -34,7 +34,7 @@ from projservo_cli.planning.motion_margins import (
     WIDTH,
     Demands,
     column,
-    columns,
+    columns_of_kind,
     pixel,
     straight_pixel,
     tag_planes,
@@ -96,8 +96,8 @@ def constraints_of(
     sides = np.sign((A @ model.P[:, 2].T)[0])
     model = model._replace(P=np.ascontiguousarray(model.P * sides[:, None, None]))
     full = np.zeros(column(CONDITIONING, V))
-    full[JOINTS], full[columns(CLEAR, V)] = 1.0, FINE_PX
-    full[columns(WIDTH, V)], full[columns(IMAGE, V)] = demands.min_face_px, demands.border_px
+    full[JOINTS], full[columns_of_kind(CLEAR, V)] = 1.0, FINE_PX
+    full[columns_of_kind(WIDTH, V)], full[columns_of_kind(IMAGE, V)] = demands.min_face_px, demands.border_px
     return Constraints(
         model=model,
         M=np.ascontiguousarray(A @ np.linalg.inv(H).T),

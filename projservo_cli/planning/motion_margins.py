@@ -87,7 +87,7 @@ CONSTRAINTS = {
 OF_MOTION = (VISIBILITY, IMAGE, JOINTS, CONDITIONING)
 
 
-def columns(kind: int, views: int) -> slice:
+def columns_of_kind(kind: int, views: int) -> slice:
     """Columns of a kind in margins of joints."""
     return slice(column(kind, views), column(kind + 1, views))
 

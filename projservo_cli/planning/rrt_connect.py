@@ -23,7 +23,7 @@ from projservo_cli.planning.joint_constraints import (
     time_between,
 )
 from projservo_cli.planning.keep_out import only
-from projservo_cli.planning.motion_margins import CLEAR, FRONT, IMAGE, JOINTS, column, columns
+from projservo_cli.planning.motion_margins import CLEAR, FRONT, IMAGE, JOINTS, column, columns_of_kind
 from projservo_cli.planning.time_parameterization import TimedPath, minimum_time, time_parameterized
 from projservo_cli.records import NO_SPREAD, FloatArray, IntArray, JointLimits
 
@@ -161,7 +161,7 @@ def find_path(
     far = np.all(np.max(off, axis=2, initial=0.0) > _NEARBY, axis=1)
     goals, rank = goals[far], rank[far]
     clearance, _ = margins_at(c._replace(spread=NO_SPREAD), start)
-    clearance[columns(IMAGE, len(c.O))] += DEVIATIONS * c.spread.most  # the face was seen there
+    clearance[columns_of_kind(IMAGE, len(c.O))] += DEVIATIONS * c.spread.most  # the face was seen there
     trial = new_trial(c)
     path = JointPath(
         goals=goals,

@@ -17,14 +17,14 @@ from projservo_cli.messages.verdicts import arrived
 from projservo_cli.records import BoolArray, ByteArray, FloatArray, InputError, IntArray, Plan, Trace
 from projservo_cli.report import style
 from projservo_cli.report.figure_inputs import PAGE_FILE, title
-from projservo_cli.report.figures.images import OF_SCENE, OF_TOOL, frames_of, with_halo
+from projservo_cli.report.figures.images import OF_SCENE, OF_TOOL, frames_of_run, with_halo
 from projservo_cli.report.figures.joint_space import tree_edges, with_gaps
 from projservo_cli.report.figures.scene import (
+    drawn_arm,
     edges_of,
     features_in_space,
     goal_displacement,
     plant_pyramids,
-    standing,
     transformed,
 )
 from projservo_cli.report.html import html_page
@@ -99,7 +99,7 @@ def motion_of(
 ) -> _Motion:
     """Return the view of runs with at least one step; ``markers`` (p, 4) at the robot's reference, m."""
     face = plant.M[plant.order]
-    _, of_face, of_rig = standing(robot, plant, plan.q_start)
+    _, of_face, of_rig = drawn_arm(robot, plant, plan.q_start)
     start = (face @ of_face.T)[:, :3]
     rig, goal = plant_pyramids(plant, start), None
     if (displacement := goal_displacement(robot, traces)) is not None:
@@ -140,7 +140,7 @@ def _driven(
     markers, features = tool
     instants, positions = _sample_times(trace.q), []
     for q in trace.q[instants]:
-        polyline, H, of_rig = standing(robot, plant, q)
+        polyline, H, of_rig = drawn_arm(robot, plant, q)
         face, points = ((M @ H.T)[:, :3] for M in (plant.M[plant.order], markers))
         positions.append((polyline, face, points, transformed(rig, of_rig), transformed(features, H)))
     moved = (np.stack(kind) for kind in zip(*positions, strict=True))
@@ -389,7 +389,7 @@ def _frames(traces: Mapping[str, Trace], order: IntArray, sizes: FloatArray) -> 
     every = [t[:, :, order].reshape(-1, 2) for run in traces.values() for t in (run.s, run.s_star[None])]
     size, views = sizes.max(axis=0), len(sizes)
     near = style.near_pixels(np.concatenate(every), size)
-    films = {name: frames_of(run, width=_FILM_WIDTH) for name, run in traces.items()}
+    films = {name: frames_of_run(run, width=_FILM_WIDTH) for name, run in traces.items()}
     margin = 0.06
     if any(film is not None for film in films.values()):  # whole images
         near, margin = np.array([[-0.5, -0.5], size - 0.5]), 0.0

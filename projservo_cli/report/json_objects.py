@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from projservo_cli.calibration.joint_model import describe_curve
-from projservo_cli.findings import REFUSES, Finding, named, of_readings, told
-from projservo_cli.messages import line, sentence, setup_of
+from projservo_cli.findings import REFUSES, Finding, from_text, named, of_readings
+from projservo_cli.messages import sentence, sentence_and_remedy, setup_of
 from projservo_cli.planning.motion_margins import CONSTRAINTS, OF_MOTION
 from projservo_cli.records import WHY_LOST, Calibration, CarriedByObject, Trace, scalars_of
 from projservo_cli.report.figure_inputs import PAGE_FILE
@@ -62,7 +62,7 @@ def failed_object(
 ) -> dict[str, Any]:
     """Return the JSON object of a stage that failed, or lacks its inputs; why : its reason and findings."""
     failure: dict[str, Any] = {"run": run.path.resolve(), "reason": why[0], "failed": at}
-    failure["findings"] = list(why[1]) or [told(why[0], REFUSES)]
+    failure["findings"] = list(why[1]) or [from_text(why[0], REFUSES)]
     if stage == "calibrate":
         lists: dict[str, Any] = {name: [] for name in ("advice", "joints", *_LISTS)}
         numbers = dict.fromkeys(_NUMBERS) | dict.fromkeys(_COUNTS, 0)
@@ -133,7 +133,9 @@ def _calibration(run: Run, names: Sequence[str | None]) -> dict[str, Any]:
     values = scalars_of(calibration) | {name: getattr(calibration, name) for name in _SHORT_ARRAYS}
     del values["model_error"], values["unshown_error"]
     setup = setup_of(calibration)
-    values["findings"] = [one.plain() | {"text": line(one, setup)} for one in calibration.findings]
+    values["findings"] = [
+        one.plain() | {"text": sentence_and_remedy(one, setup)} for one in calibration.findings
+    ]
     of_refits = zip(
         values.pop("refit"),
         () if calibration.refits is None else calibration.refits.refit_numbers.tolist(),

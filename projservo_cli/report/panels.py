@@ -25,7 +25,7 @@ def rows(
     ]
 
 
-class Run(NamedTuple):
+class DrawnRun(NamedTuple):
     """Faces of a run in the images, and how their paths are drawn."""
 
     s: FloatArray  # (k, V, m, 2) markers in cyclic order, px
@@ -33,7 +33,7 @@ class Run(NamedTuple):
     hidden: BoolArray | None = None  # (k, V) whether the face is hidden, where that is to be shown
 
 
-def images(row: Sequence["style.Axes"], runs: Sequence[Run], s_star: FloatArray) -> None:
+def images(row: Sequence["style.Axes"], runs: Sequence[DrawnRun], s_star: FloatArray) -> None:
     """Draw the paths of the markers, and the face at the start and at the goal (V, m, 2), in each image."""
     for view, panel in enumerate(row):
         for s, line, hidden in runs:
@@ -65,7 +65,7 @@ def titles(row: Sequence["style.Axes"], names: Iterable[str], heading: str = "")
         panel.set_title(f"{above}{name} camera")
 
 
-def columns(axes: "style.Axes", x: FloatArray, values: FloatArray, lines: Iterable[style.LineStyle]) -> None:
+def curves(axes: "style.Axes", x: FloatArray, values: FloatArray, lines: Iterable[style.LineStyle]) -> None:
     """Draw each column of values (k, c) over x (k,), in its style."""
     for column, line in zip(values.T, lines, strict=True):
         axes.plot(x, column, **line)

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from projservo_cli.calibration.time_offset import is_repeated_frame, time_unit
-from projservo_cli.findings import REFUSES, Finding, Subject, told
+from projservo_cli.findings import REFUSES, Finding, Subject, from_text
 from projservo_cli.image_size import ImageSize, image_sizes
 from projservo_cli.messages import failed
 from projservo_cli.plugins import what_failed
@@ -286,7 +286,7 @@ class PluginRobot:
     def remarks(self) -> list[Finding]:
         """Return the faults of the last images that the robot finds; may be empty."""
         found = self._optional("remarks", ())
-        return [one if isinstance(one, Finding) else told(str(one)) for one in found]
+        return [one if isinstance(one, Finding) else from_text(str(one)) for one in found]
 
     def identity(self) -> str:
         """Return a text that changes with the meaning of the readings; may be empty."""

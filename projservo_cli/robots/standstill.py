@@ -54,7 +54,7 @@ def seen_at_rest(
     return reading, mean, np.where(np.isfinite(mean.s[..., 0]), sigma, np.nan), count, looks
 
 
-def frames_of(looks: list[Reading], marker: IntArray) -> tuple[Observation, BoolArray]:
+def observation_of_frames(looks: list[Reading], marker: IntArray) -> tuple[Observation, BoolArray]:
     """Return the frames of looks at a robot at rest, and which are new (K, V).
 
     marker : (m,) numbers of the first markers, those on the tool.

@@ -10,7 +10,7 @@ import numpy as np
 from projservo_cli import messages
 from projservo_cli.calibration.refit import ViewError, view_errors
 from projservo_cli.detection import DICTIONARY, finder_of
-from projservo_cli.findings import LIMITS, NOTE, REFUSES, Finding, Subject, told, usable
+from projservo_cli.findings import LIMITS, NOTE, REFUSES, Finding, Subject, from_text, usable
 from projservo_cli.hardware.camera_robot import CameraRobot, View
 from projservo_cli.hardware.checks_at_rest import RobotAtRest, findings_at_rest
 from projservo_cli.hardware.checks_in_motion import Strokes, findings_of, reach_of, strokes
@@ -25,7 +25,7 @@ from projservo_cli.planning.prediction_covariance import Region
 from projservo_cli.records import Calibration, FloatArray, InputError, Observation, WorkFailed
 from projservo_cli.robots.contract import PluginRobot, at_rest_after
 from projservo_cli.robots.pacing import Steered
-from projservo_cli.robots.standstill import frames_of
+from projservo_cli.robots.standstill import observation_of_frames
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.stage_inputs import OwnRobot, PreflightInputs
 from projservo_cli.stages.worlds.external_robot import plugin_robot
@@ -52,7 +52,7 @@ class Checked(NamedTuple):
     @property
     def rows(self) -> list[dict[str, Any]]:
         """The findings as rows of a table and as data."""
-        return [messages.row(one, self.setup) | one.plain() for one in self.findings]
+        return [messages.table_row(one, self.setup) | one.plain() for one in self.findings]
 
     @property
     def refuted(self) -> str | None:
@@ -104,7 +104,9 @@ def check(
     except (InputError, WorkFailed) as error:
         if isinstance(error, InputError) and at_rest is None:
             raise
-        findings += (error.findings if isinstance(error, WorkFailed) else ()) or (told(str(error), REFUSES),)
+        findings += (error.findings if isinstance(error, WorkFailed) else ()) or (
+            from_text(str(error), REFUSES),
+        )
     setup = Setup(inputs.mount, robot.view, len(joints.types))
     return Checked(tuple(findings), at_rest, tuple(moved), mend, setup)
 
@@ -129,7 +131,7 @@ def _seen(robot: PluginRobot, inputs: PreflightInputs, progress: Progress) -> Ro
         time.sleep(period)
         readings.append(robot.read())
         progress("look", len(readings), wanted)
-    shown, fresh = frames_of(readings, np.array(inputs.numbers, dtype=np.int64))
+    shown, fresh = observation_of_frames(readings, np.array(inputs.numbers, dtype=np.int64))
     s, scatter = zip(*(_mean(shown.images[new, v]) for v, new in enumerate(fresh.T)), strict=True)
     own, cameras, views = robot.robot, list[VideoCamera](), list[View]()
     if isinstance(own, CameraRobot):

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from projservo_cli.control.law import State
-from projservo_cli.findings import LIMITS, NOTE, REFUSES, Finding, Subject, told, usable
+from projservo_cli.findings import LIMITS, NOTE, REFUSES, Finding, Subject, from_text, usable
 from projservo_cli.geometry.algebra import as_array, vec
 from projservo_cli.geometry.displacements import composed_angle
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators, project
@@ -16,7 +16,7 @@ from projservo_cli.geometry.lens import undistort
 from projservo_cli.geometry.null_space import COORDINATES, RANK_TOLERANCE
 from projservo_cli.image_size import image_sizes
 from projservo_cli.loop.task_start import begin
-from projservo_cli.messages import failed, line, lines, setup_of, text
+from projservo_cli.messages import failed, lines, sentence_and_remedy, setup_of, text
 from projservo_cli.messages.rows_by_code import Setup
 from projservo_cli.monitoring.arrival_accuracy import RigidFit, metric_points, rigid_fit
 from projservo_cli.monitoring.fault_at_rest import fault_at_rest
@@ -58,7 +58,7 @@ from projservo_cli.stages.plan_summary import findings_on, relaxed, search_summa
 from projservo_cli.stages.scenario import Scenario, scenario_of
 from projservo_cli.stages.stage_inputs import PlanInputs
 from projservo_cli.task.face import Task, center_of, face_plane
-from projservo_cli.task.incidence_contradictions import contradictions
+from projservo_cli.task.incidence_contradictions import contradicting_incidences
 from projservo_cli.task.incidences import errors_px, free_motions
 from projservo_cli.task.partition import Parts
 from projservo_cli.task.target import TaskImages
@@ -177,7 +177,7 @@ def _to_any_goal(scenario: Scenario) -> Plan:
     H_taught, shows = ends.displacements_taught(model), np.isfinite(ends.s_star[..., 0])
     scenes = ends.scenes(H_taught)
     asked, sigma_px = ends.goal.incidences, scenario.goal_error_px
-    apart = tuple(contradictions(model, ends.body, H_taught[0], scenes, asked, shows, sigma_px))
+    apart = tuple(contradicting_incidences(model, ends.body, H_taught[0], scenes, asked, shows, sigma_px))
     if not usable(apart):
         raise failed([one for one in apart if one.severity == REFUSES])
     state, task, _, _ = _partitioned(model, ends, scenario.world.inputs.trajectory, scenario.demands.limits)
@@ -319,7 +319,7 @@ def plan_task(
         except WorkFailed as error:
             if last:
                 raise
-            before.append((profile, told(str(error), NOTE)))
+            before.append((profile, from_text(str(error), NOTE)))
             continue
         if fails is None or last:
             if shut is not None and fails is not None and profile != "joint_space":
@@ -350,7 +350,7 @@ def _found(
     if profile == "joint_space":
         shut = why_closed(reaching.model, reaching.demands, search)
         if search is None or shut is not None:
-            raise InputError(f"the profile joint_space: {'' if shut is None else line(shut)}")
+            raise InputError(f"the profile joint_space: {'' if shut is None else sentence_and_remedy(shut)}")
         return joint_path(reaching, task, trajectory, search)
     if profile == "constrained":
         found = coupled(reaching, trajectory)

@@ -21,7 +21,7 @@ from projservo_cli.planning.motion_margins import (
     along_joints,
     along_shares,
     column,
-    columns,
+    columns_of_kind,
 )
 from projservo_cli.planning.prediction_covariance import spread_of
 from projservo_cli.planning.product_space import duration, evenly, plan_path
@@ -266,8 +266,8 @@ class PathReplanner:
         self._made += 1
         plan, asked, full = self._plan, self._trajectory, self._c.full.copy()
         V = len(off)
-        full[columns(IMAGE, V)] += np.abs(off).max(axis=1)
-        full[columns(CLEAR, V)] += np.abs(off).max()
+        full[columns_of_kind(IMAGE, V)] += np.abs(off).max(axis=1)
+        full[columns_of_kind(CLEAR, V)] += np.abs(off).max()
         c = self._c._replace(full=full)
         how = SearchLimits(
             asked.search.max_samples, asked.search.seed + self._made, asked.max_goal_configurations, excluded

@@ -94,7 +94,7 @@ class _Recording:
         i = int(off.argmax())
         counts = tuple(Finding("seen", amount=count) for count in seen)
         unit = "m" if units and units[i] == "m" else "rad"
-        return messages.line(
+        return messages.sentence_and_remedy(
             Finding("farthest_off", NOTE, Subject(joints=(i + 1,)), off[i], unit=unit, others=counts)
         )
 

@@ -27,7 +27,7 @@ from projservo_cli.records import (
 )
 from projservo_cli.robots.contract import Bounds, PluginRobot, Reading, at_rest_after
 from projservo_cli.robots.joint_limits import Joints
-from projservo_cli.robots.standstill import frames_of, seen_at_rest
+from projservo_cli.robots.standstill import observation_of_frames, seen_at_rest
 from projservo_cli.settings.sections import JointVector
 from projservo_cli.settings.task import Goal, GoalImages, TaskSettings, sigma_key
 from projservo_cli.simulation.faults import FaultyRobot, SimulatedRobot, robot_by_itself
@@ -159,7 +159,7 @@ def teach(
         frames=count.max(axis=1),
         moved=None if moved is None else mean.q - moved,
         bounds=robot.bounds,
-        seen=frames_of(looks, np.array(inputs.numbers, dtype=np.int64)),
+        seen=observation_of_frames(looks, np.array(inputs.numbers, dtype=np.int64)),
     )
     begin, objects = len(inputs.numbers), dict[str, _Taught]()
     for name, one in inputs.objects.named.items():

@@ -29,8 +29,8 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import TypeAdapter, ValidationError
 
-from projservo_cli.findings import LIMITS, NOTE, REFUSES, Finding, of_columns, sparse, told
-from projservo_cli.messages import line, sentence, setup_of
+from projservo_cli.findings import LIMITS, NOTE, REFUSES, Finding, from_columns, from_text, sparse
+from projservo_cli.messages import sentence, sentence_and_remedy, setup_of
 from projservo_cli.messages.verdicts import arrived
 from projservo_cli.records import (
     SIZES,
@@ -479,23 +479,23 @@ def _told(record: Any) -> tuple[Finding, ...]:
         return _told_of(record)
     fails = isinstance(record, Plan) and not record.feasible
     fails |= isinstance(record, Trace) and not arrived(record.verdict)
-    return (told(record.reason, REFUSES if fails else NOTE),)
+    return (from_text(record.reason, REFUSES if fails else NOTE),)
 
 
 def _told_of(c: Calibration) -> tuple[Finding, ...]:
     """Findings of a calibration of an earlier version, which had columns of deviations, too."""
     units, setup = ["m" if letter == "P" else "rad" for letter in c.joint_types], setup_of(c)
-    found = [told(c.reason, NOTE if c.usable else REFUSES)]
+    found = [from_text(c.reason, NOTE if c.usable else REFUSES)]
     rows = () if c.model_error_numbers is None else c.model_error_numbers.tolist()
-    found += [of_columns(*one, units) for one in zip(c.model_error, rows, strict=True)]
+    found += [from_columns(*one, units) for one in zip(c.model_error, rows, strict=True)]
     found += c.open_order
     if c.unshown_numbers is not None:
-        hidden = of_columns(c.unshown_error[0], c.unshown_numbers.tolist(), units)
+        hidden = from_columns(c.unshown_error[0], c.unshown_numbers.tolist(), units)
         found.append(Finding("unshown", effect_px=hidden.effect_px, others=(hidden,)))
-    known = {text for one in found for text in (line(one, setup), sentence(one, setup))}
+    known = {text for one in found for text in (sentence_and_remedy(one, setup), sentence(one, setup))}
     for text in c.advice:
         if text not in known:
-            found.append(told(text, NOTE if text in c.notes else LIMITS))
+            found.append(from_text(text, NOTE if text in c.notes else LIMITS))
     return tuple(found)
 
 

@@ -15,7 +15,7 @@ from projservo_cli.laws import CODES
 from projservo_cli.loop.batch import NUMBERS, VERDICT, Batch, Setting
 from projservo_cli.loop.compiled_loop import Course
 from projservo_cli.loop.verdicts import INTERRUPTED, RUNNING, VERDICT_NAMES
-from projservo_cli.messages import line
+from projservo_cli.messages import sentence_and_remedy
 from projservo_cli.messages.verdicts import VERDICTS
 from projservo_cli.records import (
     VIEWS,
@@ -339,5 +339,7 @@ def _run(
     return (
         row,
         trace_of(made) if keep else None,
-        "" if made.why is None or not VERDICTS[made.verdict].retried else line(made.why, made.setup),
+        ""
+        if made.why is None or not VERDICTS[made.verdict].retried
+        else sentence_and_remedy(made.why, made.setup),
     )

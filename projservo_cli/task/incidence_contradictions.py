@@ -24,7 +24,7 @@ _TOLD, _APART = 2.0, 5.0
 _NEGLIGIBLE_PX = 1e-3
 
 
-def contradictions(
+def contradicting_incidences(
     model: Model,
     body: Body,
     H: FloatArray,

@@ -66,7 +66,7 @@ class Place(NamedTuple):
     M: FloatArray = np.zeros((0, 4))
 
 
-class Goal(NamedTuple):
+class TargetGoal(NamedTuple):
     """What is to hold at the end: incidences, each where its carrier has it, or the whole pose."""
 
     places: tuple[Place, ...]  # of the scene, then of objects that were looked at
@@ -74,7 +74,7 @@ class Goal(NamedTuple):
     incidences: tuple[Incidence, ...] = ()  # by positions in the body; none for the whole pose
 
     @classmethod
-    def at(cls, s: FloatArray) -> "Goal":
+    def at(cls, s: FloatArray) -> "TargetGoal":
         """Return the whole pose that images (V, b, 2) show, and nothing carries."""
         return cls((Place(s),), s)
 
@@ -87,12 +87,12 @@ class Goal(NamedTuple):
         """Place of a carrier; of an object that was not looked at where the goal was taught."""
         return self.places[carrier if carrier < len(self.places) else 0]
 
-    def carried_to(self, objects: Sequence[Place]) -> "Goal":
+    def carried_to(self, objects: Sequence[Place]) -> "TargetGoal":
         """Return the goal with its objects where they are now; all of it goes along, unless that tears it."""
         found = self._replace(places=(self.places[0], *objects))
         return found if len(found.carriers) > 1 else found._replace(s=found.place(*found.carriers).s)
 
-    def to(self, s: FloatArray) -> "Goal":
+    def to(self, s: FloatArray) -> "TargetGoal":
         """Return the goal where images (V, b, 2) show it, whatever carries it."""
         return self._replace(places=tuple(place._replace(s=s) for place in self.places), s=s)
 
@@ -102,7 +102,7 @@ class TaskImages(NamedTuple):
 
     q_start: FloatArray  # (n,) joint readings at the start, rad or m, with the offset if there is one
     s_start: FloatArray  # (V, b, 2) px of the face, then of its pins, at the start; NaN if unknown
-    goal: Goal
+    goal: TargetGoal
     center: int  # index of the centre marker within the face, or ``MIDPOINT``
     pins: int = 0  # number of markers that are not on the face
     body: Body = NO_BODY  # of all markers, to measure with; none to measure point by point
@@ -137,7 +137,7 @@ class TaskImages(NamedTuple):
         """Select the markers of the face, to measure it point by point; incidences need the body."""
         m = self.s_start.shape[1] - self.pins
         s_start, s_star = (np.ascontiguousarray(s[:, :m]) for s in (self.s_start, self.s_star))
-        return self._replace(s_start=s_start, goal=Goal.at(s_star), pins=0, body=NO_BODY)
+        return self._replace(s_start=s_start, goal=TargetGoal.at(s_star), pins=0, body=NO_BODY)
 
     def task(self, model: Model) -> Task:
         """Task of laws with a model, calibrated or metric.

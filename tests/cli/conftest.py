@@ -154,7 +154,7 @@ def statistics(monkeypatch):
     }
 
     def found(*_):
-        return value | {"findings": [*validation.contradictions(value)]}
+        return value | {"findings": [*validation.contradicted_views(value)]}
 
     monkeypatch.setattr(validate, "compared", found)
     return value

@@ -8,7 +8,7 @@ import numpy as np
 from projservo_cli.planning.motion_margins import limits_alone
 from projservo_cli.records import JointLimits, no_lenses
 from projservo_cli.stages.plan import plan_task
-from projservo_cli.task.target import Goal, TaskImages, followed
+from projservo_cli.task.target import TargetGoal, TaskImages, followed
 from tests.known import asked
 from tests.scene import GAINS, Run, limits
 
@@ -27,7 +27,7 @@ def planned(sc, G=None, profile="linear", duration=None, speed=SPEED, ramp=0.0):
     if key not in _PLANS:
         n = len(sc.q_start)
         demands = limits_alone(JointLimits(np.full(n, -9.0), np.full(n, 9.0), *np.full((2, n), speed)))
-        shown = TaskImages(sc.q_start, sc.s_start, Goal.at(sc.s_star), sc.plant.center)
+        shown = TaskImages(sc.q_start, sc.s_start, TargetGoal.at(sc.s_star), sc.plant.center)
         motion = asked(profile, duration=duration, ramp=ramp)
         plan = plan_task(sc.seen(G)._replace(lens=no_lenses(2)), shown, motion, demands)
         _PLANS[key] = pickle.dumps(plan)

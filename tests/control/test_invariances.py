@@ -14,7 +14,7 @@ from projservo_cli.control.law import OK
 from projservo_cli.laws import CODES, LAW_SPECS
 from projservo_cli.loop.python_loop import BuiltInLaw
 from projservo_cli.records import FloatArray, Model
-from projservo_cli.task.target import Goal, TaskImages
+from projservo_cli.task.target import TargetGoal, TaskImages
 from tests.samples import frame, in_frame
 from tests.scene import FACE_LAWS, GAINS, scene
 
@@ -44,7 +44,10 @@ def instant(types, markers, rng) -> Instant:
     sc = scene(step, types, markers)
     q = sc.q_start + rng.uniform(0.0, 0.8) * step
     return Instant(
-        sc.model, TaskImages(sc.q_start, sc.s_start, Goal.at(sc.s_star), sc.plant.center), sc.images(q), q
+        sc.model,
+        TaskImages(sc.q_start, sc.s_start, TargetGoal.at(sc.s_star), sc.plant.center),
+        sc.images(q),
+        q,
     )
 
 

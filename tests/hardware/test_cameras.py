@@ -16,7 +16,7 @@ from projservo_cli.findings import Subject
 from projservo_cli.hardware import video_cameras
 from projservo_cli.hardware.camera_robot import CameraRobot
 from projservo_cli.hardware.video_cameras import VideoCamera
-from projservo_cli.messages import line
+from projservo_cli.messages import sentence_and_remedy
 from projservo_cli.records import WorkFailed
 from projservo_cli.settings.cameras import Cameras as Stereo
 from projservo_cli.settings.cameras import Source
@@ -101,7 +101,7 @@ def test_a_missing_or_forbidden_or_metadata_device_is_named_with_the_right_one(m
     assert video_cameras._wrong_device(nodes[0], left) is None
     second = video_cameras._wrong_device(nodes[1], left)
     assert second.code == "second_node"
-    assert line(second).endswith(f"; take {nodes[0]}")
+    assert sentence_and_remedy(second).endswith(f"; take {nodes[0]}")
     monkeypatch.setattr("os.access", lambda *_: False)
     assert video_cameras._wrong_device(nodes[0], left).code == "unreadable_device"
 

@@ -17,7 +17,7 @@ from projservo_cli.config import load_config
 from projservo_cli.config.inputs import calibration_inputs
 from projservo_cli.findings import NOTE, REFUSES, Finding, Subject, first
 from projservo_cli.hardware.checks_at_rest import RobotAtRest
-from projservo_cli.messages import line
+from projservo_cli.messages import sentence_and_remedy
 from projservo_cli.records import JointLimits, Observation
 from projservo_cli.report.image_pages import LivePage
 from projservo_cli.stages import calibrate
@@ -198,12 +198,12 @@ def test_a_calibrated_run_tells_what_changed_since(calibrated, change, words):
     lengths = np.array([[0.0, side, diagonal, side], [side, 0.0, side, diagonal]])
     lengths = np.concatenate([lengths, np.roll(lengths, 2, axis=1)])
     finding = calibration_finding(calibrated, seen, (640, 480), lengths)
-    text = line(finding)
+    text = sentence_and_remedy(finding)
     assert words in text
     assert (finding.severity == NOTE) == (words.startswith("agrees with the images"))
     unknown = calibration_finding(calibrated, seen, (640, 480), np.full((4, 4), np.nan))
     assert unknown.severity == finding.severity
-    assert "mm" not in line(unknown)
+    assert "mm" not in sentence_and_remedy(unknown)
 
 
 @pytest.mark.parametrize(("views", "slipped"), [(2, False), (2, True), (3, False)])
@@ -226,7 +226,9 @@ def test_a_camera_that_moved_is_named_with_the_poses_that_mend_it(calibrated, vi
         assert view == "right"
         off = views[1]
         assert (off.amount, off.limit < 1.0) == (pytest.approx(17.0, abs=0.5), True)
-        assert f"put the right camera back, or fit it again from {len(poses.q)} poses" in line(found[0])
+        assert f"put the right camera back, or fit it again from {len(poses.q)} poses" in sentence_and_remedy(
+            found[0]
+        )
         assert poses.before_px < poses.error_px <= 1.5 * poses.before_px
 
 

@@ -9,7 +9,7 @@ from projservo_cli.planning.goal_configurations import GoalFeatures
 from projservo_cli.planning.joint_constraints import Constraints, constraints_of
 from projservo_cli.planning.motion_margins import Demands
 from projservo_cli.simulation.random_tasks import random_tasks
-from projservo_cli.task.target import Goal, TaskImages
+from projservo_cli.task.target import TargetGoal, TaskImages
 from tests.configured import joints_of, truth_of
 from tests.known import configured
 
@@ -39,7 +39,7 @@ def case(name, k):
     truth, joints, tasks = _drawn(name)
     q_start, q_goal = tasks[0][k], tasks[1][k]
     s_start, s_star = (truth.images(q, truth.M_face) for q in (q_start, q_goal))
-    task = TaskImages(q_start, s_start, Goal.at(s_star), truth.center).task(truth.model)
+    task = TaskImages(q_start, s_start, TargetGoal.at(s_star), truth.center).task(truth.model)
     A = truth.M_face @ truth.displacement(q_start).T
     speed = np.where(np.isfinite(joints.limits.speed), joints.limits.speed, 1.0)
     keep = np.array([0.002 if kind == "P" else np.radians(1.0) for kind in joints.types])

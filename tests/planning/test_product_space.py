@@ -10,7 +10,7 @@ from projservo_cli.records import InputError, position_limits
 from projservo_cli.simulation.random_tasks import STRATA, random_tasks
 from projservo_cli.stages.plan import plan_task
 from projservo_cli.stages.report import projective_twin
-from projservo_cli.task.target import Goal, TaskImages
+from projservo_cli.task.target import TargetGoal, TaskImages
 from tests.configured import truth_of
 from tests.known import asked, configured, known_scenario
 from tests.planning.cases import constrained
@@ -28,7 +28,7 @@ class Judged:
         s_start, s_star = (truth.images(q, truth.M_face) for q in (q_start, q_goal))
         H = [truth.robot.pose(q) @ np.linalg.inv(truth.robot.base_tool) for q in (q_start, q_goal)]
         self.true = TrueTask(truth.P, truth.image_size[0], *((truth.M_face @ T.T)[:, :3] for T in H))
-        shown = TaskImages(q_start, s_start, Goal.at(s_star), truth.center)
+        shown = TaskImages(q_start, s_start, TargetGoal.at(s_star), truth.center)
         self.plan = plan = plan_task(model, shown, asked("constrained"), known_scenario(config).demands)
         fine = np.linspace(0.0, 1.0, 1001)
         mu = np.stack([np.interp(fine, plan.path_parameter, column) for column in plan.mu.T], axis=1)

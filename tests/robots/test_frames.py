@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from projservo_cli.records import Trace
-from projservo_cli.report.figures.images import frames_of
+from projservo_cli.report.figures.images import frames_of_run
 from projservo_cli.robots.frame_recorder import MOST_FRAMES, FrameRecorder
 from projservo_cli.store.run_file import load
 from tests.fake_records import fake
@@ -28,7 +28,7 @@ def test_frames_are_thinned_evenly_and_the_first_and_last_are_kept(looks):
     assert len(set(ways[:-1])) <= 1
     assert len(ways) < 2 or ways[-1] <= ways[0]
     np.testing.assert_array_equal(told.frame_s, [s + k for k in instant])
-    shown = frames_of(fake(Trace, **vars(told)))
+    shown = frames_of_run(fake(Trace, **vars(told)))
     assert [film.shape for film in shown] == [(len(instant), 8, 16)] * 2
     assert shown[0].mean(axis=(1, 2)) == pytest.approx(instant % 251, abs=1.0)
     assert shown[1].mean(axis=(1, 2)) == pytest.approx(255 - instant % 251, abs=1.0)
@@ -56,12 +56,12 @@ def test_the_frames_of_a_run_show_what_was_found_in_them(servo):
     assert trace.frame_index[0] == 0
     assert trace.frame_index[-1] == trace.steps
     assert trace.frame_jpeg.nbytes < 3e6
-    frames = np.stack(frames_of(trace), axis=1)
+    frames = np.stack(frames_of_run(trace), axis=1)
     assert frames.shape[1:] == (2, 1024, 1280)
     k, view = np.indices(trace.frame_s.shape[:3])[:2]
     u, v = np.moveaxis(trace.frame_s, -1, 0).round().astype(int)
     assert frames[k, view, v, u].min() > 180
     assert np.median(frames) == pytest.approx(30, abs=1)
-    half = frames_of(trace, np.array([3]), width=640)
+    half = frames_of_run(trace, np.array([3]), width=640)
     assert [film.shape for film in half] == [(1, 512, 640)] * 2
     assert Image.open(io.BytesIO(trace.frame_jpeg[: trace.frame_size[0, 0]].tobytes())).mode == "L"

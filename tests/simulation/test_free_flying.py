@@ -19,7 +19,7 @@ from projservo_cli.records import Model, no_lenses, position_limits
 from projservo_cli.simulation.analytic_plant import AnalyticPlant, Plant
 from projservo_cli.simulation.arm import METRIC_A_INF
 from projservo_cli.task.face import center_of, cyclic_order, face_plane
-from projservo_cli.task.target import Goal, TaskImages
+from projservo_cli.task.target import TargetGoal, TaskImages
 from tests.samples import displacement, hat, pixels
 
 P = np.array([np.c_[np.eye(3), [0.15, 0, 0]], np.c_[np.eye(3), [-0.15, 0, 0]]])
@@ -78,7 +78,7 @@ def drive(law, perturbation, max_steps=3000):
     plant = free_flying_plant(P, M, -1)
     gains = Gains(GAIN, GAIN, GAIN, GAIN, 1.0, GAIN, PERIOD, 0.9)
     ends = Limits(np.full(6, math.inf), CONVERGED_RMS, 10.0, 20, max_steps, False, False)
-    task = TaskImages(np.zeros(6), pixels(P, M), Goal.at(pixels(P, M_star)), -1).task(plant.model)
+    task = TaskImages(np.zeros(6), pixels(P, M), TargetGoal.at(pixels(P, M_star)), -1).task(plant.model)
     rig = FreeFlying(plant, np.zeros(6), np.zeros((max_steps + 1, 2, 5, 2)))
     built_in = BuiltInLaw(CODES[law], plant.model, task, gains)
     verdict, steps, log = run_in_python(built_in, rig, task.s_star, PERIOD, ends)

@@ -17,7 +17,7 @@ from projservo_cli.planning.joint_constraints import constraints_of
 from projservo_cli.planning.motion_margins import limits_alone
 from projservo_cli.planning.rrt_connect import SearchLimits, find_path
 from projservo_cli.simulation.random_tasks import random_tasks
-from projservo_cli.task.target import Goal, TaskImages
+from projservo_cli.task.target import TargetGoal, TaskImages
 from tests.configured import calibrate, joints_of, truth_of
 from tests.known import configured, with_task
 
@@ -73,7 +73,7 @@ def true_search(config, *, margins=False):
     start, goal = config.task.start, config.task.goal.joints
     q_start, q_goal = (np.array(q.values(config.joint_types)) for q in (start, goal))
     s_start, s_star = (truth.images(q, truth.M_face) for q in (q_start, q_goal))
-    task = TaskImages(q_start, s_start, Goal.at(s_star), truth.center).task(truth.model)
+    task = TaskImages(q_start, s_start, TargetGoal.at(s_star), truth.center).task(truth.model)
     A = truth.M_face @ truth.displacement(q_start).T
     demands = limits_alone(joints.limits)._replace(image_size=truth.image_size)
     if margins:

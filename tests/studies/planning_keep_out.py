@@ -30,7 +30,7 @@ from projservo_cli.simulation.random_tasks import random_tasks
 from projservo_cli.stages.runs.run_trace import trace_of
 from projservo_cli.stages.servo import drive
 from projservo_cli.stages.worlds.simulated import SimulatedWorld
-from projservo_cli.task.target import Goal, TaskImages
+from projservo_cli.task.target import TargetGoal, TaskImages
 from tests.configured import calibrate, joints_of, plan, scenario_of, truth_of
 from tests.known import configured, with_task
 from tests.studies.common import rate
@@ -158,7 +158,7 @@ def with_box(config, truth: Truth, ends, rng):
 def true_constraints(config, truth: Truth, task: Drawn, q):
     """What joints are held against from joints (n,) on: the true model, border 0, limits without margin."""
     s_start, s_star = (truth.images(x, truth.M_face) for x in (q, task.q_goal))
-    aimed = TaskImages(q, s_start, Goal.at(s_star), truth.center).task(truth.model)
+    aimed = TaskImages(q, s_start, TargetGoal.at(s_star), truth.center).task(truth.model)
     joints = joints_of(config)
     demands = limits_alone(joints.limits)._replace(image_size=truth.image_size)
     A = truth.M[[*truth.face, *truth.pins]] @ truth.displacement(q).T
@@ -173,7 +173,9 @@ def way_exists(config, truth: Truth, task: Drawn):
     """Whether a way through the polygons is found with the true model, and after how many searches."""
     c = true_constraints(config, truth, task, task.q_start)
     s_star = truth.images(task.q_goal, truth.M_face)
-    aimed = TaskImages(task.q_start, truth.images(task.q_start, truth.M_face), Goal.at(s_star), truth.center)
+    aimed = TaskImages(
+        task.q_start, truth.images(task.q_start, truth.M_face), TargetGoal.at(s_star), truth.center
+    )
     aim = GoalFeatures(aimed.task(truth.model).A_star, s_star, 0.0)
     searches = 0
     for samples, seeds in ESCALATED:

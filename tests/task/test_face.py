@@ -7,7 +7,7 @@ import pytest
 
 from projservo_cli.records import WorkFailed
 from projservo_cli.task.face import MIDPOINT, center_of, cyclic_order, face_plane
-from projservo_cli.task.target import Goal, TaskImages
+from projservo_cli.task.target import TargetGoal, TaskImages
 from tests.samples import arm, displacement, face, frame, in_frame, pixels
 from tests.task.cases import SQUARE, SQUARE_CENTER, turned
 
@@ -72,7 +72,7 @@ def test_plane_is_oriented_and_carried_along(seed):
 
 
 def images_for(model, s_start, s_star):
-    return TaskImages(model.q_reference, s_start, Goal.at(s_star), MIDPOINT).task(model)
+    return TaskImages(model.q_reference, s_start, TargetGoal.at(s_star), MIDPOINT).task(model)
 
 
 def images(A, T):

@@ -22,7 +22,7 @@ from projservo_cli.records import (
 )
 from projservo_cli.task.body_pose import SETTLED, fit_body, make_body
 from projservo_cli.task.face import MIDPOINT, center_of, cyclic_order, face_plane
-from projservo_cli.task.incidence_contradictions import contradictions
+from projservo_cli.task.incidence_contradictions import contradicting_incidences
 from projservo_cli.task.incidence_errors import angle_off
 from projservo_cli.task.incidences import (
     Incidence,
@@ -247,7 +247,7 @@ def contradicting(asked, seed, sigma_px, G=None):
     H = poe(there, model.q_reference + deviating(rng))
     shows = np.ones((2, len(M)), dtype=bool)
     body, pairs = make_body(there, M @ G.T), asked(M)
-    return list(contradictions(there, body, H, scenes(body, H, pairs), pairs, shows, sigma_px))
+    return list(contradicting_incidences(there, body, H, scenes(body, H, pairs), pairs, shows, sigma_px))
 
 
 def apart(asked, seed=0, sigma_px=0.1, G=None):

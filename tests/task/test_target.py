@@ -9,7 +9,7 @@ from projservo_cli.geometry.algebra import as_array, mat
 from projservo_cli.records import WorkFailed
 from projservo_cli.task.body_pose import SETTLED, fit_body, make_body
 from projservo_cli.task.face import UNSEEN_GOAL, require_found
-from projservo_cli.task.target import Goal, TaskImages
+from projservo_cli.task.target import TargetGoal, TaskImages
 from tests.samples import frame, pixels, poe
 from tests.scene import scene, with_pins
 
@@ -23,7 +23,7 @@ def case(G=None):
     s = [pixels(sc.model.P, M @ poe(sc.model, q).T) for q in (sc.q_start, sc.q_goal)]
     return (
         model,
-        TaskImages(sc.q_start, s[0], Goal.at(s[1]), -1, 5, body),
+        TaskImages(sc.q_start, s[0], TargetGoal.at(s[1]), -1, 5, body),
         body.M[:4] @ poe(model, sc.q_goal).T,
     )
 

@@ -31,7 +31,7 @@ _OF_TAGS, _OF_A_TAG = ("marker_drift", "marker_step"), 3
 _STEPS, _ONSETS, _SHARE = 8, 16, 1.0 / 3.0
 
 
-def standing(detections: Detections) -> BoolArray:
+def motionless(detections: Detections) -> BoolArray:
     """Mask (m,) of markers whose images stand still in all views while those of the others move."""
     pixels = detections.dense()
     seen = np.isfinite(pixels[..., 0])
@@ -49,7 +49,7 @@ def standing(detections: Detections) -> BoolArray:
     return found if (~found).sum() >= _LEFT else np.zeros_like(found)
 
 
-def standing_markers(detections: Detections, which: BoolArray) -> Finding:
+def motionless_finding(detections: Detections, which: BoolArray) -> Finding:
     """Return the finding on markers (m,) that stand still."""
     numbers = tuple(detections.marker[which].tolist())
     return Finding("standing_markers", LIMITS, Subject(markers=numbers), len(numbers), unit="1")

@@ -122,7 +122,7 @@ def straight_joints(solution: Solution) -> list[int]:
     return [int(i) for i in np.flatnonzero(found)]
 
 
-def deviation(solution: Solution, expected: Expected) -> Finding | None:
+def main_deviation(solution: Solution, expected: Expected) -> Finding | None:
     """Find the deviation from the model that explains most of a fit that is refused."""
     if expected.known or solution.dof <= 0:
         return None

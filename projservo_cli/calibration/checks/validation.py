@@ -347,7 +347,7 @@ def residual_statistics(calibration: Calibration, observation: Observation) -> d
         },
         "advice": list(lines(told, setup_of(calibration))),
     }
-    return found | {"findings": [*told, *contradictions(found)]}
+    return found | {"findings": [*told, *contradicted_views(found)]}
 
 
 def comparable(calibration: Calibration, observation: Observation) -> tuple[Observation, tuple[Finding, ...]]:
@@ -371,7 +371,7 @@ def median_limit(found: Mapping[str, Any]) -> Finding:
     )
 
 
-def contradictions(found: Mapping[str, Any]) -> Iterator[Finding]:
+def contradicted_views(found: Mapping[str, Any]) -> Iterator[Finding]:
     """Tell by the statistics of residuals whether a median passes its limit: of some views, or of all."""
     limit, median = found["limit_px"], found["median_px"]
     if limit is None:

@@ -11,8 +11,8 @@ from projservo_cli.calibration.bundle_adjustment import LeastSquares
 from projservo_cli.calibration.detections import (
     Detections,
     cauchy_weights,
-    deviation,
     even_choice,
+    robust_deviation,
 )
 from projservo_cli.calibration.initial.epipolar import ImageGeometry, similarity
 from projservo_cli.calibration.initial.triangulation import Tracks
@@ -77,7 +77,7 @@ def resected(points: FloatArray, pixels: FloatArray) -> FloatArray:
     P = candidates[np.nanargmin(medians)]
     for _ in range(_ROUNDS):
         distance = np.linalg.norm(_off(P, X, x), axis=-1)
-        weight = cauchy_weights((distance / (2.0 * deviation(distance, 1e-12))) ** 2)
+        weight = cauchy_weights((distance / (2.0 * robust_deviation(distance, 1e-12))) ** 2)
         P = _linear(X, x, np.sqrt(weight) / np.abs(X @ P[2]))
     P = np.linalg.inv(T) @ P @ U
     ahead = np.sign(np.median(points @ P[2] / points[:, 3]))

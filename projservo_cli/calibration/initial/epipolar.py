@@ -15,7 +15,7 @@ from scipy.optimize import least_squares, minimize_scalar
 from scipy.spatial.transform import Rotation
 from scipy.special import stdtrit
 
-from projservo_cli.calibration.detections import Detections, deviation, even_choice, medians
+from projservo_cli.calibration.detections import Detections, even_choice, medians, robust_deviation
 from projservo_cli.geometry.displacements import homogeneous
 from projservo_cli.image_size import ImageSize, image_sizes
 from projservo_cli.records import BoolArray, FloatArray, IntArray, WorkFailed
@@ -154,12 +154,14 @@ class Epipolar(ImageGeometry):
         F = candidates[np.argmin(medians)]
         for _ in range(10):
             r, slope = sampson(F, a, b, weight)
-            F = _eight_point(a, b, 1.0 / (slope * np.sqrt(1.0 + (r / (2.0 * deviation(r, 1e-12))) ** 2)))
+            F = _eight_point(
+                a, b, 1.0 / (slope * np.sqrt(1.0 + (r / (2.0 * robust_deviation(r, 1e-12))) ** 2))
+            )
         F = _refine(F, a, b, weight)
         product = T_.T @ F @ T
         in_pixels: FloatArray = product / float(np.linalg.norm(product))
         residual, _ = sampson(in_pixels, homogeneous(left), homogeneous(right), weight)
-        inlier = np.abs(residual) <= OUTLIER * deviation(residual, 1e-9)
+        inlier = np.abs(residual) <= OUTLIER * robust_deviation(residual, 1e-9)
         if inlier.sum() <= _PARAMETERS:
             raise WorkFailed("the observations of the two cameras share no epipolar geometry: check the rows")
         sigma = float(np.sqrt((residual[inlier] ** 2).sum() / (inlier.sum() - _PARAMETERS)))
@@ -208,7 +210,7 @@ class Core(NamedTuple):
     @classmethod
     def of(cls, residual: FloatArray, pose_of: IntArray) -> "Core":
         """Estimate it from residuals (N,) at poses (N,), less the parameters of the fundamental matrix."""
-        r, s = np.abs(residual), deviation(residual, 1e-12)
+        r, s = np.abs(residual), robust_deviation(residual, 1e-12)
         for _ in range(_CORE_ROUNDS):
             before, s = s, s * float(np.sqrt(min(max(_core_square(r / s), 0.25), 4.0)))
             if abs(s - before) <= _CORE_SETTLED * s:
@@ -292,7 +294,7 @@ def _refine(F: FloatArray, left: FloatArray, right: FloatArray, weight: FloatArr
     def distances(x: FloatArray) -> FloatArray:
         return sampson(turned(x), left, right, weight)[0]
 
-    scale = 2.0 * deviation(sampson(F, left, right, weight)[0], 1e-12)
+    scale = 2.0 * robust_deviation(sampson(F, left, right, weight)[0], 1e-12)
     fit = least_squares(
         distances, np.zeros(7), "3-point", loss="cauchy", f_scale=scale, ftol=_TIGHT, xtol=_TIGHT, gtol=_TIGHT
     )

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from projservo_cli.calibration.bundle_adjustment import LeastSquares
-from projservo_cli.calibration.detections import Detections, cauchy_weights, deviation, per_block
+from projservo_cli.calibration.detections import Detections, cauchy_weights, per_block, robust_deviation
 from projservo_cli.calibration.initial.epipolar import ImageFrame, ImageGeometry, log_distances, marker_pairs
 from projservo_cli.calibration.prediction import Parameters
 from projservo_cli.geometry.displacements import aligned, cross_matrix
@@ -183,7 +183,7 @@ def _robust_align(
     R, t = motion
     for _ in range(_ROUNDS):
         residual = np.linalg.norm(points - body @ np.swapaxes(R, 1, 2) - t[:, None], axis=2)
-        square = (residual / (2.0 * deviation(residual[seen], 1e-12))) ** 2
+        square = (residual / (2.0 * robust_deviation(residual[seen], 1e-12))) ** 2
         R, t = aligned(body, points, np.where(seen, cauchy_weights(square), 0.0))
     return R, t
 
@@ -356,11 +356,11 @@ def _robust_solve(
         A = np.tensordot(left * weight[:, None, None], left, axes=((0, 1), (0, 1)))
         x = np.linalg.solve(A[:-1, :-1] + np.diag(ridge), A[:-1, -1])
         residual = np.linalg.norm(left[..., -1] - left[..., :-1] @ x, axis=1)
-        weight = cauchy_weights((residual / (2.0 * deviation(residual, _MIN_SCALE))) ** 2)
+        weight = cauchy_weights((residual / (2.0 * robust_deviation(residual, _MIN_SCALE))) ** 2)
     return np.asarray(x), np.asarray(means[..., -1] - means[..., :-1] @ x)
 
 
-class Body(NamedTuple):
+class GuessedBody(NamedTuple):
     """Cameras and placed points by a guess, and the body that these are of, whatever the joints read."""
 
     P: FloatArray  # (V, 3, 4)
@@ -369,7 +369,7 @@ class Body(NamedTuple):
     alignment: _Alignment
 
 
-def bodies(search: Search, detections: Detections, factor: float = 1.0) -> Iterator[Body]:
+def bodies(search: Search, detections: Detections, factor: float = 1.0) -> Iterator[GuessedBody]:
     """Yield bodies by the guesses of the geometry of images, most promising first, at a factor of the focal.
 
     Raises WorkFailed if no three markers are seen together.
@@ -379,14 +379,14 @@ def bodies(search: Search, detections: Detections, factor: float = 1.0) -> Itera
         alignment = _grow_body(points[placed], detections.rows(placed), search.rng)
         if np.isfinite(alignment.body[:, 0]).sum() < _MIN_MARKERS:
             raise WorkFailed("no three markers are seen together: more must be seen at once")
-        yield Body(P, placed, points[placed], alignment)
+        yield GuessedBody(P, placed, points[placed], alignment)
 
 
 def starts(
     search: Search,
     detections: Detections,
     factors: tuple[float, ...] = (1.0,),
-    known: Sequence[Body] | None = None,
+    known: Sequence[GuessedBody] | None = None,
 ) -> Iterator[Parameters]:
     """Yield initial parameters, most promising first: factors of the best focal lengths, and axes for each.
 

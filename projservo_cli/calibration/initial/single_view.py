@@ -24,8 +24,8 @@ from projservo_cli.calibration.detections import (
     RAYLEIGH,
     Detections,
     cauchy_weights,
-    deviation,
     even_choice,
+    robust_deviation,
 )
 from projservo_cli.calibration.initial.epipolar import (
     OUTLIER,
@@ -262,7 +262,7 @@ def _factorised(images: FloatArray, placed: BoolArray) -> tuple[FloatArray, Floa
         X -= X[placed].mean(axis=0) * placed[:, None]
         if number >= _PLAIN_ROUNDS:
             off = np.linalg.norm(np.einsum("kca,ja->kjc", A, X) + b[:, None] - known, axis=2)
-            width = 2.0 * deviation(off[seen & placed], _AFFINE * extent)
+            width = 2.0 * robust_deviation(off[seen & placed], _AFFINE * extent)
             loss = cauchy_weights((off / width) ** 2)
     return A, b, X
 

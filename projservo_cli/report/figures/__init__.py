@@ -35,7 +35,7 @@ def of_calibration(
 
 def of_scene(truth: Any, q: Any) -> "Figure":
     """Draw figure 3 at joints (n,) alone: arm, face and cameras."""
-    polyline, of_face, of_rig = scene.standing(truth.robot, truth, q)
+    polyline, of_face, of_rig = scene.drawn_arm(truth.robot, truth, q)
     face = (truth.M_face[cyclic_order(truth.M_face)] @ of_face.T)[:, :3]
     pyramids = scene.transformed(scene.plant_pyramids(truth, face), of_rig)
     data = {"robot": polyline, "face_start": face, "pyramids": pyramids, "view": np.array(truth.view)}

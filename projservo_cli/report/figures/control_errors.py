@@ -262,7 +262,7 @@ def _draw_runs(data: Data, figure: "style.Figure") -> None:
     rows = panels.rows(figure, [len(names), 3] * len(runs))
     units = "deg or mm" if slides.any() and not slides.all() else "mm" if slides.all() else "deg"
     for name, images, (error, joints, commands) in zip(runs, rows[::2], rows[1::2], strict=True):
-        panels.images(images, [panels.Run(data[f"s_{name}"], panels.PATH)], data[f"s_star_{name}"])
+        panels.images(images, [panels.DrawnRun(data[f"s_{name}"], panels.PATH)], data[f"s_star_{name}"])
         panels.cameras(images, names, str(data[f"verdict_{name}"]))
         t = data[f"t_s_{name}"]
         panels.errors(error, [(t, data[f"error_px_{name}"], style.line(style.BLACK))], ylabel="error (px)")

@@ -66,7 +66,7 @@ def _draw_classical(data: Data, figure: "style.Figure") -> None:
     rows = panels.rows(figure, [len(names)] * len(laws), heights)
     for row, law, pixels in zip(rows, laws, near, strict=True):
         s = data[f"s_{law}"]
-        panels.images(row, [panels.Run(s, _PATH, data[f"hidden_{law}"])], data[f"s_star_{law}"])
+        panels.images(row, [panels.DrawnRun(s, _PATH, data[f"hidden_{law}"])], data[f"s_star_{law}"])
         for view, panel in enumerate(row):
             for first, last in data[f"plateau_{law}"]:
                 style.paths(panel, s[first : last + 1, view], _PLATEAU | {"markevery": [0]})
@@ -94,7 +94,9 @@ def _data_direct(report_data: ReportData) -> Data:
 )
 def _draw_direct(data: Data, figure: "style.Figure") -> None:
     """Both laws over one another, one panel a camera."""
-    runs = [panels.Run(data[f"s_{law}"], style.LAW_LINES[law] | {"label": title_of(law)}) for law in DIRECT]
+    runs = [
+        panels.DrawnRun(data[f"s_{law}"], style.LAW_LINES[law] | {"label": title_of(law)}) for law in DIRECT
+    ]
     names, aspect = data["view"], style.aspect(np.concatenate([run.s for run in runs]))
     figure.set_figheight(_panel_width(len(names)) * aspect + 1.05)
     (row,) = panels.rows(figure, [len(names)])
@@ -217,7 +219,7 @@ def _draw_overview(data: Data, figure: "style.Figure") -> None:
     images = [figure.add_subplot(cell) for cell in cells]
     control, pixel = figure.add_subplot(grid[0, 1]), figure.add_subplot(grid[1:, 1])
     lines = {law: style.LAW_LINES[law] | {"label": str(data[f"verdict_{law}"])} for law in _OVERVIEW_LAWS}
-    runs = [panels.Run(data[f"s_{law}"], line, data[f"hidden_{law}"]) for law, line in lines.items()]
+    runs = [panels.DrawnRun(data[f"s_{law}"], line, data[f"hidden_{law}"]) for law, line in lines.items()]
     panels.images(images, runs[::-1], data["s_star"])
     for view, panel in enumerate(images):
         panel.plot(*data["center"][:, view].T, **_CENTER)
@@ -261,7 +263,7 @@ _FINE = {"linewidth": 1.6, "markersize": 2.0}  # over frames
 _FAINT_FACE = style.line(style.GREY, width=0.7, label="face at the start and at the end")
 
 
-def frames_of(
+def frames_of_run(
     trace: Trace, selected: IntArray | None = None, width: int | None = None
 ) -> list[ByteArray] | None:
     """Frames (k, height, width) of each view of a run, of those kept the selected (k,); None without any.
@@ -307,7 +309,7 @@ def _data_frames(report_data: Driven | ReportData) -> Data:
     assert kept is not None
     half = np.abs(trace.image_error[kept.frame_index] - 0.5 * trace.image_error[0])
     selected = np.array([0, int(np.nanargmin(half)), len(half) - 1])
-    frames = frames_of(trace, selected)
+    frames = frames_of_run(trace, selected)
     assert frames is not None
     return {
         "run": np.array(f"{title(name)}, {trace.verdict}"),

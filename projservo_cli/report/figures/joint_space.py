@@ -138,7 +138,7 @@ def _draw(data: Data, figure: "style.Figure") -> None:
     )
     for view, panel in enumerate(images):
         _around(panel, data, view)
-    panels.images(images, [panels.Run(data["s"], panels.PATH)], data["s_star"])
+    panels.images(images, [panels.DrawnRun(data["s"], panels.PATH)], data["s_star"])
     panels.cameras(images, names, str(data["name"]), visible)
     for view, panel in enumerate(images):
         _center(panel, data, data["center"][:, view])

@@ -41,7 +41,7 @@ _LINES = {
 def _data(report_data: ReportData) -> Data:
     """Joints, faces and cameras in metres; the robot at the start as a polyline through its axes."""
     plant, robot, q_goal = report_data.plant, report_data.robot, report_data.plan.q[-1]
-    polyline, start, of_rig = standing(robot, plant, report_data.plan.q_start)
+    polyline, start, of_rig = drawn_arm(robot, plant, report_data.plan.q_start)
     face = plant.M[plant.order]
     result: Data = {"robot": polyline, "face_start": (face @ start.T)[:, :3]}
     rig = plant_pyramids(plant, result["face_start"])
@@ -53,7 +53,7 @@ def _data(report_data: ReportData) -> Data:
         far = float((result["face_start"].mean(axis=0) - point) @ direction)
         result["roll_axis"] = np.stack([point, point + 1.1 * far * direction])
     if np.isfinite(q_goal).all():
-        result["robot_goal"], _, of_rig = standing(robot, plant, q_goal)
+        result["robot_goal"], _, of_rig = drawn_arm(robot, plant, q_goal)
         if plant.model.on_tool:
             result["pyramids_goal"] = transformed(rig, of_rig)
     if plant.model.on_tool:  # the face stands still
@@ -67,7 +67,7 @@ def _data(report_data: ReportData) -> Data:
     return result
 
 
-def standing(robot: SerialArm, plant: Plant, q: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def drawn_arm(robot: SerialArm, plant: Plant, q: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Polyline (k, 3) of the robot at joints q (n,), m, and displacements of the face and of the cameras.
 
     From the reference one of both has moved with the tool: in the base frame the other stands still.

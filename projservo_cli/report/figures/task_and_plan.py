@@ -328,12 +328,12 @@ def _draw_planned(data: Data, figure: "style.Figure") -> None:
     sigma, shares = data["sigma"], None
     if np.isfinite(data["mu"]).all():
         shares = figure.add_subplot(grid[0, 1])
-        panels.columns(shares, sigma, data["mu"], _SHARES)
+        panels.curves(shares, sigma, data["mu"], _SHARES)
         shares.set_ylabel(_SHARE)
         shares.tick_params(labelbottom=False)
     # A path through joint space has no shares.
     margins = figure.add_subplot(grid[1, 1] if shares else grid[:, 1], sharex=shares)
-    panels.columns(margins, sigma, data["margin"], style.view_lines(data["view"]))
+    panels.curves(margins, sigma, data["margin"], style.view_lines(data["view"]))
     style.zero_line(margins)
     margins.set(xlabel=_SIGMA, ylabel=_MARGIN)
     style.legend_below(figure, 6, [style.dots(style.BLACK, "o", "first marker of the face")])
@@ -420,8 +420,8 @@ def _draw_path(data: Data, figure: "style.Figure") -> None:
     for view, panel in enumerate(maps):
         _map(panel, data, view)
     panels.titles(maps, names, f"{data['profile']} profile")
-    panels.columns(shares, data["sigma"], data["mu"], _SHARES)
-    panels.columns(margins, data["sigma"], data["along"], _MARGINS)
+    panels.curves(shares, data["sigma"], data["mu"], _SHARES)
+    panels.curves(margins, data["sigma"], data["along"], _MARGINS)
     shares.set(xlabel=_SIGMA, ylabel=_SHARE)
     margins.set(xlabel=_SIGMA, ylabel="margin (1)")
     style.zero_line(margins)

@@ -13,7 +13,7 @@ from projservo_cli.records import (
 from projservo_cli.settings.task import GoalImages, TaskSettings
 from projservo_cli.task.incidences import Flat
 from projservo_cli.task.stand_off import StandOff
-from projservo_cli.task.target import Goal, TaskImages
+from projservo_cli.task.target import TargetGoal, TaskImages
 
 
 def task_images(
@@ -43,11 +43,11 @@ def task_images(
         pixels = task.goal.images.pixels(numbers[0], view)
         s_star = np.array([pixels.get(number, unseen(len(s_start))) for number in (*numbers[0], *numbers[1])])
         s_star = np.ascontiguousarray(np.swapaxes(s_star, 0, 1))
-        return TaskImages(q_start, s_start, Goal.at(s_star), center, pins), None
+        return TaskImages(q_start, s_start, TargetGoal.at(s_star), center, pins), None
     if task.goal.of_start:
-        return TaskImages(q_start, s_start, Goal.at(s_start), center, pins), q_start
+        return TaskImages(q_start, s_start, TargetGoal.at(s_start), center, pins), q_start
     q_goal = turn(q_from) if given is None else given.values(types)
-    return TaskImages(q_start, s_start, Goal.at(images(q_goal, "task.goal")), center, pins), q_goal
+    return TaskImages(q_start, s_start, TargetGoal.at(images(q_goal, "task.goal")), center, pins), q_goal
 
 
 def _joints_at_start(task: TaskSettings, q_current: FloatArray | None, types: str) -> FloatArray:
