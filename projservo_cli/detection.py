@@ -635,7 +635,7 @@ class Board(NamedTuple):
         return self.kind == "chessboard" and (self.rows + self.columns) % 2 == 0
 
     @property
-    def places(self) -> FloatArray:
+    def grid_points(self) -> FloatArray:
         """Places (N, 2) of the corners on the board, in squares."""
         return np.indices(self.shape)[::-1].reshape(2, -1).T.astype(np.float64)
 
@@ -695,13 +695,13 @@ class BoardFinder(Finder):
         image : (height, width) grey values from 0 to 255.
         """
         for guess in self._guesses(image.astype(np.uint8)):
-            seen = self.board.places[np.isfinite(guess[:, 0])]
+            seen = self.board.grid_points[np.isfinite(guess[:, 0])]
             if len(seen) < _LEAST_CORNERS or np.linalg.matrix_rank(seen - seen[0]) < 2:
                 continue
-            _, steps = self._grid(self.board.places, guess)
+            _, steps = self._grid(self.board.grid_points, guess)
             corners, light = _refine_saddles(image, guess, steps, _CROSS if self._detectors else np.inf)
-            corners = self._smooth(self.board.places, corners)
-            light *= (-1.0) ** self.board.places.sum(axis=1)
+            corners = self._smooth(self.board.grid_points, corners)
+            light *= (-1.0) ** self.board.grid_points.sum(axis=1)
             contrast = np.median(light[corners.clean]) if corners.clean.any() else 1.0
             usual = (np.abs(light / contrast - 1.0) < _UNLIKE) | ~corners.clean
             shows = (usual & np.isfinite(corners.sigma)).reshape(self.board.shape)

@@ -51,7 +51,7 @@ from projservo_cli.store.display import (
 )
 from projservo_cli.store.files_and_locks import bytes_of
 from projservo_cli.task.displaced_object import DisplacedObject
-from projservo_cli.task.object_bundle_adjustment import Look
+from projservo_cli.task.object_bundle_adjustment import ObjectView
 
 _AT_ONCE = 100  # poses whose derivatives are worked out together: more of them leave the cache
 _MAX_BYTES = 10_000_000  # maximum size of a URDF
@@ -420,7 +420,9 @@ class ImageModel(Displayable, Calibration):
             If images or joints do not show the displacement, with the freedom that is missing.
         """
         shape = (len(self.view), len(marker), 2)
-        seen = [Look(checked_array(f"looks[{i}]", s, shape, f"{shape} px")) for i, s in enumerate(looks)]
+        seen = [
+            ObjectView(checked_array(f"looks[{i}]", s, shape, f"{shape} px")) for i, s in enumerate(looks)
+        ]
         if len(seen) < 2:
             raise InputError(f"looks: {len(seen)}, of two or more: one when the goal was taught, and one now")
         return DisplacedObject.of(self, marker, seen, metric)

@@ -19,7 +19,7 @@ from projservo_cli.calibration.checks.markers_not_on_tool import (
     without_strange,
 )
 from projservo_cli.calibration.checks.mislabelled_data import relabelled
-from projservo_cli.calibration.checks.mismatched_poses import on_shown_poses
+from projservo_cli.calibration.checks.mismatched_poses import findings_on_imaged_poses
 from projservo_cli.calibration.checks.model_errors import ModelCheck
 from projservo_cli.calibration.checks.observability_and_verdict import WEAK_NOISE, assess
 from projservo_cli.calibration.checks.outliers import (
@@ -410,7 +410,7 @@ def _record(
     counts = len(found.suspect) + len(found.poses), len(found.id_switches)
     verdict = assess(solution, errors, expected, outlier, counts, suspicion, limit_px)
     check, (about, *rest) = verdict.check, verdict.findings
-    of_images = *moved_images(detections, found.moved), *on_shown_poses(detections, found.shown)
+    of_images = *moved_images(detections, found.moved), *findings_on_imaged_poses(detections, found.shown)
     findings = (about, *rest, *of_images)
     # Deviations hold on average over other poses, with the model's own error.
     factor = 1.0

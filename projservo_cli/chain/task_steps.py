@@ -55,7 +55,7 @@ class Steps:
         self.session.require_acts(actions)  # which refuses what could not act later
         return self.session.reading()
 
-    def standing(self, c: Calibration) -> FloatArray:
+    def joints_before(self, c: Calibration) -> FloatArray:
         """Joints (n,) where the arm stands before anything moves it, rad or m."""
         if not self.config.plant.simulated:
             return self.opened(c)
@@ -72,7 +72,7 @@ class Steps:
             return None
         k = self.motions.index(part) if part else 0
         if k == 0:
-            return None if task.start_joints is not None else self.standing(run.calibration)
+            return None if task.start_joints is not None else self.joints_before(run.calibration)
         before = self.motions[k - 1]
         end: FloatArray = run.at_step(before).plan.q[-1]
         if not np.isfinite(end).all():

@@ -279,7 +279,7 @@ def _set_up(capture: Any, settings: Source, where: Subject) -> Iterator[Finding]
     if settings.focus is not None:
         focus = capture.get(cv.CAP_PROP_FOCUS)
         if not focuses or (focus != _UNKNOWN and abs(focus - settings.focus) > _FOCUS_STEP):
-            yield Finding("unset_focus", LIMITS, where, _told(focus), limit=settings.focus)
+            yield Finding("unset_focus", LIMITS, where, _known_or_nan(focus), limit=settings.focus)
     if settings.exposure_ms is None:
         yield Finding("free_exposure", LIMITS, where)
         return
@@ -289,7 +289,9 @@ def _set_up(capture: Any, settings: Source, where: Subject) -> Iterator[Finding]
     value = capture.get(cv.CAP_PROP_EXPOSURE)
     time_ms = value if value in (0, _UNKNOWN) else 0.1 * value if v4l else 1e3 * 2.0**value
     if not exposes or (time_ms > 0 and abs(math.log2(time_ms / settings.exposure_ms)) > _EXPOSURE_STEP):
-        yield Finding("unset_exposure", LIMITS, where, _told(time_ms), limit=settings.exposure_ms, unit="ms")
+        yield Finding(
+            "unset_exposure", LIMITS, where, _known_or_nan(time_ms), limit=settings.exposure_ms, unit="ms"
+        )
 
 
 def _expose(capture: Any, exposure_ms: float, v4l: bool) -> bool:
@@ -307,7 +309,7 @@ def _code_of(number: float) -> str:
     return code if code.isascii() and code.isprintable() else ""
 
 
-def _told(value: float) -> float:
+def _known_or_nan(value: float) -> float:
     """Return the value that a driver tells; NaN where it does not say."""
     return math.nan if value in (0, _UNKNOWN) else value
 

@@ -9,7 +9,7 @@ from itertools import groupby
 
 from projservo_cli.deviations import DEVIATIONS
 from projservo_cli.findings import LIMITS, NOTE, REFUSES, Finding, first, to_columns, usable
-from projservo_cli.messages.placeholders import Told, quantity
+from projservo_cli.messages.placeholders import Wording, quantity
 from projservo_cli.messages.rows_by_code import ROWS, Setup
 from projservo_cli.records import Calibration, CalibrationVerdict, WorkFailed
 
@@ -31,7 +31,7 @@ _OF_REASON = ("noise", "residuals", "joint_noise", "deviations", "unshown")
 
 def limit(one: Finding, setup: Setup) -> str:
     """Return what a finding limits predictions by, after "limited by"."""
-    return Told([one], setup).text("limit")
+    return Wording([one], setup).text("limit")
 
 
 def sentence(one: Finding, setup: Setup = _SETUP) -> str:
@@ -52,7 +52,7 @@ def lines(findings: Iterable[Finding], setup: Setup = _SETUP) -> tuple[str, ...]
 
 def table_row(one: Finding, setup: Setup) -> dict[str, str]:
     """Return a finding as a row of a table: its level, what it is about, what is found, and the remedy."""
-    told = Told([one], setup)
+    told = Wording([one], setup)
     where, remedy = told.text("where") or "robot and cameras", told.text("remedy")
     return {"level": _LEVELS[one.severity], "where": where, "text": sentence(one, setup), "remedy": remedy}
 
@@ -156,14 +156,14 @@ def _cause(findings: Sequence[Finding]) -> Finding:
 
 
 def _line(alike: list[Finding], setup: Setup) -> str:
-    remedy = Told(alike, setup).text("remedy")
+    remedy = Wording(alike, setup).text("remedy")
     text = _sentence(alike, setup)
     return text + (("; " if ": " in text else ": ") + remedy if remedy else "")
 
 
 def _sentence(alike: list[Finding], setup: Setup) -> str:
     one = alike[0]
-    text = Told(alike, setup).text("sentence")
+    text = Wording(alike, setup).text("sentence")
     if one.code in DEVIATIONS and one.others:
         others = ", or ".join(limit(other, setup) for other in one.others)
         text += f" (or {others}: the images do not tell)"

@@ -47,7 +47,7 @@ _FREEDOMS = {
 }
 
 
-class Told:
+class Wording:
     """Findings that one line tells, the first for all; values are looked up as in a dictionary."""
 
     def __init__(self, alike: Sequence[Finding], setup: Setup) -> None:
@@ -64,7 +64,7 @@ class Told:
 
     def others(self, part: str) -> list[str]:
         """Return the same of each of those that the first consists of."""
-        return [Told([one], self.setup).text(part) for one in self.one.others]
+        return [Wording([one], self.setup).text(part) for one in self.one.others]
 
     @property
     def subject(self) -> Subject:
@@ -104,12 +104,12 @@ def joined(words: Iterable[object]) -> str:
     return " and ".join(filter(None, (", ".join(told[:-1]), *told[-1:])))
 
 
-def _joints(told: Told) -> str:
+def _joints(told: Wording) -> str:
     everything = (told.one.code == "scale" and not told.single) or not told.joints
     return "all joints" if everything else numbered("joint", told.joints)
 
 
-def _leads(told: Told) -> str:
+def _leads(told: Wording) -> str:
     """Say what a start leads to that was not used."""
     if math.isnan(told.one.amount):
         cameras = "both cameras" if len(told.setup.view) == 2 else told["all_cameras"]
@@ -186,7 +186,7 @@ def _shared(others: Sequence[Finding]) -> str:
     return ""
 
 
-def _cameras(told: Told) -> str:
+def _cameras(told: Wording) -> str:
     """Name the cameras of some of the views."""
     views, names = told.subject.views, told.setup.view
     if 1 < len(views) == len(names) and told.one.code != "exchanged_cameras":
@@ -196,7 +196,7 @@ def _cameras(told: Told) -> str:
     return f"the {joined(views)} camera{'s' * (len(views) > 1)}"
 
 
-def _alike(told: Told) -> str:
+def _alike(told: Wording) -> str:
     """Say what looks like a joint that slipped: motions of what it ends at, and a link that flexes."""
     first, last = (
         ("the base or the scene turned likewise", "what holds the cameras turned likewise on the tool")
@@ -207,7 +207,7 @@ def _alike(told: Told) -> str:
     return "".join(f" or {what}" for what in ends + ["its link flexes"] * bool(told.one.others))
 
 
-def _left(told: Told) -> str:
+def _left(told: Wording) -> str:
     """Say what is left of the translation, a share, and of the rotation, beside the error."""
     each = [
         f"{quantity(one.amount, one.unit)} of rotation"
@@ -218,7 +218,7 @@ def _left(told: Told) -> str:
     return "".join(f"{text} and " for text in each)
 
 
-def _dark(told: Told) -> str:
+def _dark(told: Wording) -> str:
     """Say which cameras show no marker."""
     dark, views = told.subject.views, told.setup.view
     if len(dark) == 1:
@@ -228,7 +228,7 @@ def _dark(told: Told) -> str:
     return f"none of the cameras {', '.join(dark)} shows a marker"
 
 
-def _enough_see(told: Told) -> str:
+def _enough_see(told: Wording) -> str:
     """Say how many cameras see the face that are to; ``limit`` is their number."""
     least, cameras = told.one.limit, len(told.setup.view)
     if least < cameras:
@@ -243,7 +243,7 @@ def _fixed(one: Finding, sign: str = "") -> str:
     return f"{amount:{sign}.{digits}f}{unit} ± {factor * one.deviation:.{digits}f}{unit}"
 
 
-def _shifted(told: Told) -> str:
+def _shifted(told: Wording) -> str:
     """Say how an image is shifted against the other, or the others."""
     if not told.one.others:
         return ""
@@ -252,7 +252,7 @@ def _shifted(told: Told) -> str:
     return f", as if the {told['view']} image were shifted by ({by}) px against the {others}"
 
 
-def _about_line(told: Told) -> str:
+def _about_line(told: Wording) -> str:
     """Say about which line of markers an object may be turned."""
     return "".join(
         f" about the line of {numbered('marker', one.subject.markers)}" for one in told.one.others[:1]
@@ -274,7 +274,7 @@ def sharing(views: Sequence[str]) -> str:
     return {1: f"the {views[0]} camera sees", 2: "both cameras see"}.get(len(views), "two cameras see")
 
 
-def _looked(told: Told) -> str:
+def _looked(told: Wording) -> str:
     """Say where a recording looked: in the poses of a joint, or where the robot stands."""
     poses = len(told.subject.poses)
     return (
@@ -282,7 +282,7 @@ def _looked(told: Told) -> str:
     )
 
 
-def _by_views(told: Told, one: str, two: str, more: str) -> str:
+def _by_views(told: Wording, one: str, two: str, more: str) -> str:
     """Choose words by the number of the cameras."""
     return {1: one, 2: two}.get(len(told.setup.view), more)
 
@@ -294,21 +294,21 @@ def _play(one: Finding) -> str:
     return f"{one.subject.name} {size}"
 
 
-def _within(told: Told) -> str:
+def _within(told: Wording) -> str:
     """Say how far images and joints agree on the tool, where its size is known."""
     if math.isnan(told.one.amount):
         return ""
     return f", which show the tool within {quantity(told.one.amount, 'm', 2)} of where its joints put it"
 
 
-def _model_errors(told: Told) -> str:
+def _model_errors(told: Wording) -> str:
     """Join what is off in a model, and what else it may be."""
     *words, last = told.others("sentence")
     undecided = told.one.others[-1].code == "undecided_model"
     return f"{' and '.join(words)} {last}" if undecided else " and ".join((*words, last))
 
 
-VALUES: dict[str, Callable[[Told], object]] = {
+VALUES: dict[str, Callable[[Wording], object]] = {
     # Of the subject.
     "of": lambda told: told.subject.joints,
     "name": lambda told: told.subject.name,

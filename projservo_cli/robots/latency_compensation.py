@@ -246,7 +246,7 @@ class DrivenRobot:
         held : whether the arm may be held meanwhile, to see whether that lasts.
         """
         if held:
-            self._held_while(lambda: bool(max(self._dark) >= WINDOW), _LASTS)
+            self._persists(lambda: bool(max(self._dark) >= WINDOW), _LASTS)
         views = self.robot.view
         dark = [view for view, looks in zip(views, self._dark, strict=True) if looks >= WINDOW]
         if len(views) - len(dark) >= min(seeing, len(views)):
@@ -260,11 +260,11 @@ class DrivenRobot:
         """
         if (monitor := self.monitor) is not None:
             if held:
-                self._held_while(lambda: bool(fault_of_mean(monitor)), _LASTS)
+                self._persists(lambda: bool(fault_of_mean(monitor)), _LASTS)
             self.disturbance = self.disturbance or fault_of_mean(monitor)
         return self.disturbance
 
-    def _held_while(self, wrong: Callable[[], bool], looks: int) -> bool:
+    def _persists(self, wrong: Callable[[], bool], looks: int) -> bool:
         """Hold the arm while something is wrong with images; whether it lasted for all of some looks."""
         for _ in range(looks):
             if self.disturbance or not wrong():
@@ -281,7 +281,7 @@ class DrivenRobot:
     def agrees(self) -> Finding | None:
         """Test the last images, holding the arm while they disagree; return the fault."""
         self.observe()
-        if self._held_while(lambda: self.holds, _MOST_LOOKS):
+        if self._persists(lambda: self.holds, _MOST_LOOKS):
             self.give_up()
         return self.disturbance
 

@@ -186,7 +186,7 @@ class Markers(Section):
     def known(self) -> tuple[int, ...] | None:
         """Numbers of all markers, in the order of ``points``; None if a table has them."""
         if self.board is not None:
-            return tuple(range(len(self.board.pattern.places)))
+            return tuple(range(len(self.board.pattern.grid_points)))
         if self.tags is not None:
             return tuple(number for tag in self.all_tags for number in tag.numbers)
         if self.numbers is None and self.positions_m is not None:
@@ -217,7 +217,7 @@ class Markers(Section):
             known = self.known or ()
             X = self.points[[known.index(number) for number in numbers]]
         elif self.board is not None and self.board.size_m is not None:
-            X[:, 2], X[:, :2] = 0.0, self.board.size_m * self.board.pattern.places[[*numbers]]
+            X[:, 2], X[:, :2] = 0.0, self.board.size_m * self.board.pattern.grid_points[[*numbers]]
         elif self.tag_size_m is not None:
             corners = np.reshape([_CORNERS[k % CORNERS] for k in numbers], (-1, 2))
             X[:, 2], X[:, :2] = 0.0, self.tag_size_m * corners

@@ -60,7 +60,7 @@ def _camera(camera: Camera) -> FloatArray:
     assert camera.target_m is not None
     (f_u, f_v), (u, v) = camera.focal_px, camera.principal_point_px
     K = np.array([[f_u, 0.0, u], [0.0, f_v, v], [0.0, 0.0, 1.0]])
-    return _look_at(K, camera.position_m, camera.target_m, camera.up)
+    return _camera_towards(K, camera.position_m, camera.target_m, camera.up)
 
 
 def _metric_camera(P: FloatArray) -> FloatArray:
@@ -69,7 +69,7 @@ def _metric_camera(P: FloatArray) -> FloatArray:
     return P / scale if abs(scale - 1.0) > 1e-12 else P
 
 
-def _look_at(
+def _camera_towards(
     K: FloatArray, position: Sequence[float], target: Sequence[float], up: Sequence[float]
 ) -> FloatArray:
     """Camera (3, 4) to px with intrinsics K (3, 3) at a position that looks at a target, m."""

@@ -15,7 +15,7 @@ from projservo_cli.robots.session import Session
 from projservo_cli.stages.scenario import Scenario
 from projservo_cli.stages.stage_inputs import CarryingObject, KnownLengths
 from projservo_cli.task.displaced_object import DisplacedObject
-from projservo_cli.task.object_bundle_adjustment import Look, UncertainPoints
+from projservo_cli.task.object_bundle_adjustment import ObjectView, UncertainPoints
 
 
 def in_metres(calibration: Calibration, known: KnownLengths) -> tuple[Metric | None, str]:
@@ -58,7 +58,7 @@ def _carried(scenario: Scenario, carrier: CarryingObject, session: Session | Non
     """Look at an object anew, and carry the goal along with it; arguments as above."""
     c = scenario.world.calibration
     metric, _ = in_metres(c, carrier.lengths)
-    taught, now = scenario.world.look(carrier, session, scenario.exact, scenario.q_taught)
+    taught, now = scenario.world.observe_object(carrier, session, scenario.exact, scenario.q_taught)
     try:
         found = DisplacedObject.of(c, carrier.numbers, [taught, now], metric)
         goal = found.carry(_goal(scenario, c))
@@ -95,7 +95,7 @@ def markers_now(c: Calibration, carried: CarriedByObject) -> UncertainPoints:
     """Return the markers of an object of a plan where it is now."""
     numbers, taught = carried.object_marker.tolist(), carried.s_object_taught
     assert taught is not None
-    looks = [Look(taught), Look(carried.s_object, carried.sigma_object)]
+    looks = [ObjectView(taught), ObjectView(carried.s_object, carried.sigma_object)]
     return DisplacedObject.of(c, numbers, looks).markers_now(numbers)
 
 
@@ -127,13 +127,13 @@ def _known(number: float) -> float | None:
     return None if math.isnan(number) else number
 
 
-def _goal(scenario: Scenario, c: Calibration) -> Look:
+def _goal(scenario: Scenario, c: Calibration) -> ObjectView:
     """Images of the markers of the calibration at the goal as it was taught, and their deviations."""
     if (given := scenario.goal_pixels) is not None:
-        return Look(*given)
+        return ObjectView(*given)
     s = np.full((len(c.view), len(c.marker), 2), np.nan)
-    s[:, c.indices_of(scenario.world.numbers)] = scenario.world.shown(
+    s[:, c.indices_of(scenario.world.numbers)] = scenario.world.averaged_images(
         scenario.exact, scenario.q_taught, scenario.world.inputs.seed
     ).s_star
     noise = scenario.world.inputs.noise.at_rest_px
-    return Look(s, np.full(s.shape[:2], noise) if noise > 0.0 else None)
+    return ObjectView(s, np.full(s.shape[:2], noise) if noise > 0.0 else None)

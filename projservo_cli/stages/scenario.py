@@ -181,7 +181,10 @@ class Scenario:
 
     def images_at(self, seed: int) -> TaskImages:
         """Start and goal as the images of a seed show them; a goal may be carried along, then displaced."""
-        images, asked = self.world.shown(self.exact, self.q_taught, seed), self.world.inputs.displaced
+        images, asked = (
+            self.world.averaged_images(self.exact, self.q_taught, seed),
+            self.world.inputs.displaced,
+        )
         if self.objects:
             images = images._replace(goal=images.goal.carried_to(self.objects))
         if asked is None:

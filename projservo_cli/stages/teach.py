@@ -260,7 +260,7 @@ def checked(inputs: PlanInputs, calibration: Calibration, taught: _Taught) -> _C
         inputs,
         seen_px=tuple((width, height) for width, height in seen_px),
         task=TaskSettings(start=start, goal=Goal(images=taught.images)),
-        incidences=tuple(one._replace(carrier=0) for one in inputs.incidences if one.shown_by(markers)),
+        incidences=tuple(one._replace(carrier=0) for one in inputs.incidences if one.visible_by(markers)),
         carriers=(),
         displaced=None,
         trajectory=inputs.trajectory.model_copy(update={"profile": profile, "keep_out": ()}),

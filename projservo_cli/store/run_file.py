@@ -469,20 +469,20 @@ def load_record(group: h5py.Group, kind: Any, sizes: dict[str, int]) -> Any:
         raise ValueError("its calibration is by the method closed_form, which is retired")
     record = composed(kind, values | lists)
     if "findings" in values and "findings" not in group.attrs:
-        return changed(record, findings=_told(record))
+        return changed(record, findings=_earlier_findings(record))
     return record
 
 
-def _told(record: Any) -> tuple[Finding, ...]:
+def _earlier_findings(record: Any) -> tuple[Finding, ...]:
     """Findings of a record of an earlier version, which stored sentences alone."""
     if isinstance(record, Calibration):
-        return _told_of(record)
+        return _earlier_findings_of_calibration(record)
     fails = isinstance(record, Plan) and not record.feasible
     fails |= isinstance(record, Trace) and not arrived(record.verdict)
     return (from_text(record.reason, REFUSES if fails else NOTE),)
 
 
-def _told_of(c: Calibration) -> tuple[Finding, ...]:
+def _earlier_findings_of_calibration(c: Calibration) -> tuple[Finding, ...]:
     """Findings of a calibration of an earlier version, which had columns of deviations, too."""
     units, setup = ["m" if letter == "P" else "rad" for letter in c.joint_types], setup_of(c)
     found = [from_text(c.reason, NOTE if c.usable else REFUSES)]

@@ -38,8 +38,8 @@ from projservo_cli.records import (
 from projservo_cli.task.object_bundle_adjustment import (
     Bundle,
     BundleFit,
-    Look,
-    LookRig,
+    ObjectView,
+    ObjectViewRig,
     UncertainPoints,
     differ,
     unknown,
@@ -78,9 +78,9 @@ class _Placed(NamedTuple):
 class _Search:
     """Search for an object in looks at it."""
 
-    rig: LookRig
+    rig: ObjectViewRig
     marker: Sequence[int]  # (k,) numbers of its markers
-    looks: Sequence[Look]
+    looks: Sequence[ObjectView]
 
     @cached_property
     def views(self) -> IntArray:
@@ -88,7 +88,7 @@ class _Search:
         return np.array([np.isfinite(look.s).all(axis=-1).sum(axis=0) for look in self.looks])
 
     @property
-    def least(self) -> int:
+    def min_markers(self) -> int:
         """Number of markers that a look needs."""
         return RIGID if self.rig.rigid else _AFFINE
 
@@ -119,11 +119,11 @@ class _Search:
         base = int(np.argmax((self.views > 1).sum(axis=1)))
         X = self.points(base, np.eye(4))
         known = np.isfinite(X[:, 0])
-        if known.sum() < self.least:
+        if known.sum() < self.min_markers:
             alone = len(self.looks[0].s) == 1
             of = Subject() if alone else self.of(known, look=base)
             code = "object_without_size" if alone else "object_without_shape"
-            raise unknown(Finding(code, REFUSES, of, float(known.sum()), limit=self.least, unit="1"))
+            raise unknown(Finding(code, REFUSES, of, float(known.sum()), limit=self.min_markers, unit="1"))
         fit = BundleFit.settled(self.bundle([base], known, X, 0), X[known], np.eye(4)[None])
         placed, last = _Placed(fit, (base,), known), len(self.looks) - 1
         for look in dict.fromkeys((last, 0, *range(1, last))):
@@ -140,9 +140,9 @@ class _Search:
         X = np.full((len(self.marker), 4), np.nan)
         X[placed.known] = placed.fit.X
         shown = placed.known & (self.views[look] > 0)
-        if shown.sum() < self.least:
+        if shown.sum() < self.min_markers:
             of, seen = self.of(shown, when), float(shown.sum())
-            raise unknown(Finding("object_hidden", REFUSES, of, seen, limit=self.least, unit="1"))
+            raise unknown(Finding("object_hidden", REFUSES, of, seen, limit=self.min_markers, unit="1"))
         found = []
         for start in self._structures(placed, X):
             T, _ = self.bundle([look], shown, start).poses(start[shown], self.rig.turns)
@@ -217,7 +217,7 @@ class _Left(NamedTuple):
     of_calibration: FloatArray  # (N, c) by its errors
 
     @classmethod
-    def of(cls, rig: LookRig, fit: BundleFit) -> Self:
+    def of(cls, rig: ObjectViewRig, fit: BundleFit) -> Self:
         """Residuals of a fit."""
         r, J = fit.linearized()
         share = 1.0 / np.hypot(1.0, ALIKE_PX * np.repeat(fit.bundle.weight[fit.bundle.weight > 0.0], 2))
@@ -232,7 +232,7 @@ class _Left(NamedTuple):
         return r, float(r @ r - along @ np.linalg.solve(np.eye(left.shape[1]) + left.T @ left, along))
 
 
-def _elsewhere(rig: LookRig, fit: BundleFit, marker: Sequence[int]) -> _Off | None:
+def _elsewhere(rig: ObjectViewRig, fit: BundleFit, marker: Sequence[int]) -> _Off | None:
     """Find markers (k,) that do not lie as they did; None if all do.
 
     By all residuals, else by those that one tag leaves which moved by itself since the first look.
@@ -265,7 +265,7 @@ def _tags(marker: Sequence[int]) -> list[tuple[int, ...]]:
     return [tuple(at[number] for number in tag) for tag in whole if all(number in at for number in tag)]
 
 
-def _by_motion(rig: LookRig, fit: BundleFit, tag: Sequence[int]) -> FloatArray:
+def _by_motion(rig: ObjectViewRig, fit: BundleFit, tag: Sequence[int]) -> FloatArray:
     """Derivatives (L, V, k, 2, g) of images by displacements of some markers in the last look."""
     bundle, X, T = fit.bundle, fit.X[None], fit.T[None]
     own = bundle._replace(E=generators(rig.linear, fit.X[list(tag), :3].mean(axis=0)))
@@ -276,7 +276,7 @@ def _by_motion(rig: LookRig, fit: BundleFit, tag: Sequence[int]) -> FloatArray:
 
 
 def _of_one_object(
-    rig: LookRig, marker: Sequence[int], looks: Sequence[Look]
+    rig: ObjectViewRig, marker: Sequence[int], looks: Sequence[ObjectView]
 ) -> tuple[BundleFit, BoolArray, tuple[int, ...]]:
     """The object as found in looks, its markers (k,) that are known, and numbers of those that were left out.
 
@@ -304,10 +304,10 @@ def _of_one_object(
 def images_by_motion(c: Calibration, s: FloatArray) -> FloatArray:
     """Derivatives (V, k, 2, g) of the images (V, k, 2) of an object by displacements of it, px.
 
-    NaN for markers that fewer than two views show. Raises WorkFailed as ``LookRig.of``.
+    NaN for markers that fewer than two views show. Raises WorkFailed as ``ObjectViewRig.of``.
     """
-    rig, every = LookRig.of(c), np.arange(s.shape[1])
-    search = _Search(rig, every.tolist(), [Look(s, np.ones(s.shape[:2]))])
+    rig, every = ObjectViewRig.of(c), np.arange(s.shape[1])
+    search = _Search(rig, every.tolist(), [ObjectView(s, np.ones(s.shape[:2]))])
     X = search.points(0, np.eye(4))
     known = np.isfinite(X[:, 0])
     found = np.full((*s.shape, len(rig.linear) + 3), np.nan)
@@ -364,7 +364,7 @@ class DisplacedObject:
     noise_factor: float  # residuals over their deviation, rms per degree of freedom
     unit_mm: float  # mm in a unit of the frame that it was found in; NaN without a known length
     left_out: tuple[int, ...]  # numbers of markers that were off by themselves in a look, and left out of it
-    _rig: LookRig
+    _rig: ObjectViewRig
     _fit: BundleFit
 
     @property
@@ -374,7 +374,7 @@ class DisplacedObject:
 
     @classmethod
     def of(
-        cls, c: Calibration, marker: Sequence[int], looks: Sequence[Look], metric: Metric | None = None
+        cls, c: Calibration, marker: Sequence[int], looks: Sequence[ObjectView], metric: Metric | None = None
     ) -> Self:
         """Find the displacement of an object by all looks at it.
 
@@ -392,7 +392,7 @@ class DisplacedObject:
             raise InputError(
                 "objects: cameras on the tool see the scene that the goal is on: its own images are the goal"
             )
-        rig = LookRig.of(c)
+        rig = ObjectViewRig.of(c)
         fit, known, left_out = _of_one_object(rig, marker, looks)
         numbers = tuple(np.asarray(marker)[known].tolist())
         T, back = fit.T[-1] @ np.linalg.inv(fit.T[0]), np.linalg.inv(rig.G)
@@ -423,7 +423,7 @@ class DisplacedObject:
             *(np.where(unseen[:, None], np.nan, found.X[at]), found.by_images[at], found.by_calibration[at])
         )
 
-    def carry(self, goal: Look | FloatArray) -> _CarriedGoal:
+    def carry(self, goal: ObjectView | FloatArray) -> _CarriedGoal:
         """Carry a goal of the tool along that was taught at the first look.
 
         goal : images (V, m, 2) of the markers of the tool there, px, in the order of the calibration; NaN
@@ -431,7 +431,7 @@ class DisplacedObject:
         Raises WorkFailed if they do not determine a pose of the tool, or the carried one is out of sight.
         """
         rig, fit = self._rig, self._fit
-        tool = _tool_at(rig, goal if isinstance(goal, Look) else Look(goal))
+        tool = _tool_at(rig, goal if isinstance(goal, ObjectView) else ObjectView(goal))
         to_taught = np.linalg.inv(fit.T[0])
         H = fit.T[-1] @ to_taught @ tool.T[0]
         placed = tool.X @ H.T
@@ -439,7 +439,7 @@ class DisplacedObject:
             raise unknown(Finding("carried_behind", REFUSES))
         s = rig.pixels(placed)[0]
         # All markers in all views; a motion of the object takes the tool along, as one of the tool itself.
-        out = rig.bundle([Look(s, np.ones(s.shape[:2]))], tool.bundle.E)
+        out = rig.bundle([ObjectView(s, np.ones(s.shape[:2]))], tool.bundle.E)
         by_point = out.residuals(placed[None], np.eye(4)[None, None])[1]
 
         def by(E: FloatArray, points: FloatArray, T: FloatArray) -> FloatArray:
@@ -458,7 +458,7 @@ class DisplacedObject:
             exact = rig._replace(P=rig.P[:1], lens=rig.lens[:1])
             return exact.pixels(held @ (fit.T[-1] @ T).swapaxes(1, 2)).reshape(len(T), -1)
 
-        bent = _bent(images, fit.bundle.E, np.hstack([xi, xi_c]))
+        bent = _second_order(images, fit.bundle.E, np.hstack([xi, xi_c]))
         changes = np.concatenate([by_now @ xi, by_goal @ goal_s, of_calibration, bent], axis=1)
         pose = by(generators(rig.turns, placed[:, :3].mean(axis=0)), placed, np.eye(4))
         pose_changes = np.linalg.pinv(pose) @ changes
@@ -483,7 +483,9 @@ class DisplacedObject:
         return xi, xi_c
 
 
-def _bent(images: Callable[[FloatArray], FloatArray], E: FloatArray, errors: FloatArray) -> FloatArray:
+def _second_order(
+    images: Callable[[FloatArray], FloatArray], E: FloatArray, errors: FloatArray
+) -> FloatArray:
     """Changes (N, c) of second order of images (N,), uncorrelated with each other and with those of first.
 
     The tool is beside the object, so a turn by an error takes it along an arc.
@@ -502,7 +504,7 @@ def _bent(images: Callable[[FloatArray], FloatArray], E: FloatArray, errors: Flo
     return np.column_stack([np.where(i == j, np.sqrt(0.5), 1.0) * bent, mean])
 
 
-def _unit_m(rig: LookRig, metric: Metric) -> float:
+def _unit_m(rig: ObjectViewRig, metric: Metric) -> float:
     """Length of a unit of the frame of a rig, m, by the two markers of the tool farthest apart."""
     X, M = metric.markers, rig.M[0]
     apart = np.linalg.norm(X[:, None] - X, axis=-1)
@@ -510,7 +512,7 @@ def _unit_m(rig: LookRig, metric: Metric) -> float:
     return float(apart[i, j] / np.linalg.norm(M[i] - M[j]))
 
 
-def _tool_at(rig: LookRig, goal: Look) -> BundleFit:
+def _tool_at(rig: ObjectViewRig, goal: ObjectView) -> BundleFit:
     """Fit the pose of the tool to its images at a goal.
 
     Raises WorkFailed if they do not determine it.

@@ -14,7 +14,7 @@ from projservo_cli.task.incidences import (
     Incidences,
     each_in_pixels,
     incidences_of,
-    least_errors,
+    min_errors,
     turned_about,
 )
 
@@ -61,7 +61,7 @@ def _apart(incidences: Incidences, body: Body, H: FloatArray, numbers: Sequence[
     H : (4, 4) displacement beside which a better one is sought first; then to all sides.
     """
     rows = incidences.of(numbers)
-    _, squares = least_errors(rows, body, H[None])
+    _, squares = min_errors(rows, body, H[None])
     if math.sqrt(2.0 * squares[0]) > _NEGLIGIBLE_PX:
-        squares = least_errors(rows, body, turned_about(body, H))[1]
+        squares = min_errors(rows, body, turned_about(body, H))[1]
     return math.sqrt(2.0 * float(np.min(squares)))

@@ -16,7 +16,13 @@ from projservo_cli.metric.frame import changes_of
 from projservo_cli.monitoring.arrival_accuracy import metres_by
 from projservo_cli.records import MEET, MM, PARALLEL, PERPENDICULAR, Calibration, FloatArray, WorkFailed
 from projservo_cli.task.incidences import Incidence, points_of
-from projservo_cli.task.object_bundle_adjustment import NO_POINTS, BundleFit, Look, LookRig, UncertainPoints
+from projservo_cli.task.object_bundle_adjustment import (
+    NO_POINTS,
+    BundleFit,
+    ObjectView,
+    ObjectViewRig,
+    UncertainPoints,
+)
 
 # Angle between features, rad, by their relation.
 _WANTED = {MEET: 0.0, PARALLEL: 0.0, PERPENDICULAR: 0.5 * np.pi}
@@ -78,8 +84,8 @@ def angle_off(one: Incidence, tool: FloatArray, scene: FloatArray) -> float:
 class TaughtAndNow(NamedTuple):
     """Where a goal was taught, and where the tool is: images (V, k, 2), and displacements to begin with."""
 
-    taught: Look
-    now: Look
+    taught: ObjectView
+    now: ObjectView
     H_taught: FloatArray
     H: FloatArray  # H_taught, H: (4, 4) in the calibrated frame
     taught_mm: float = 0.0
@@ -108,7 +114,7 @@ class Placed(NamedTuple):
 
     def on_object(self, one: Incidence) -> bool:
         """Whether the feature of the scene is of the markers of the object, and none that was taught."""
-        return not one.shown_by(range(self.M.shape[1]))
+        return not one.visible_by(range(self.M.shape[1]))
 
     def features(
         self,
@@ -164,16 +170,16 @@ class Placed(NamedTuple):
 
 
 @lru_cache(maxsize=8)
-def metric_rig(c: Calibration) -> LookRig | None:
+def metric_rig(c: Calibration) -> ObjectViewRig | None:
     """Cameras and tool in the metric of the arm; None where the joints leave it open."""
     try:
-        rig = LookRig.of(c)
+        rig = ObjectViewRig.of(c)
     except WorkFailed:
         return None
     return rig if rig.rigid else None
 
 
-def placed_by(rig: LookRig, markers: Sequence[int], ends: TaughtAndNow, unit_mm: FloatArray) -> Placed:
+def placed_by(rig: ObjectViewRig, markers: Sequence[int], ends: TaughtAndNow, unit_mm: FloatArray) -> Placed:
     """Fit both poses of the body to their images."""
     M, back = rig.M[:, list(markers)], np.linalg.inv(rig.G)
     E = generators(rig.turns, M[0, :, :3].mean(axis=0))

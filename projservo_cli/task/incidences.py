@@ -69,7 +69,7 @@ class Incidence(NamedTuple):
     angle_deg: float = math.nan  # between both, for ``ANGLE``
     carrier: int = 0  # of the feature of the scene, by places of the goal: the scene, then objects
 
-    def shown_by(self, markers: Collection[int]) -> bool:
+    def visible_by(self, markers: Collection[int]) -> bool:
         """Whether the feature of the scene is where one of the tool was, which has these markers."""
         return all(number in markers for point in self.scene for number in point)
 
@@ -486,7 +486,7 @@ def each_in_pixels(
     return NO_INCIDENCES._replace(rows=rows, senses=np.concatenate([one.senses for one in found]))
 
 
-def least_errors(incidences: Incidences, body: Body, H: FloatArray) -> tuple[FloatArray, FloatArray]:
+def min_errors(incidences: Incidences, body: Body, H: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Displacements (s, 4, 4) beside some at which all rows together err least, and their squares (s,), px².
 
     incidences : each row by itself; one that depends on others counts. H : (s, 4, 4). The square of a feature

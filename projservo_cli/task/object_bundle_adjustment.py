@@ -47,18 +47,18 @@ def unknown(one: Finding) -> WorkFailed:
     return failed([one], stage="objects")
 
 
-class Look(NamedTuple):
+class ObjectView(NamedTuple):
     """Images of markers at one time."""
 
     s: FloatArray  # (V, k, 2) px, as cameras report them; NaN where unseen
     sigma: FloatArray | None = None  # (V, k) deviation of a coordinate, px; None or NaN: as calibrated
 
-    def of(self, markers: BoolArray) -> "Look":
+    def of(self, markers: BoolArray) -> "ObjectView":
         """Images of some markers (k,)."""
-        return Look(self.s[:, markers], None if self.sigma is None else self.sigma[:, markers])
+        return ObjectView(self.s[:, markers], None if self.sigma is None else self.sigma[:, markers])
 
 
-class LookRig(NamedTuple):
+class ObjectViewRig(NamedTuple):
     """Cameras and tool, as calibrated and off by its errors, with the plane at infinity (0, 0, 0, 1).
 
     Displacements are rigid there, if the joints determine the metric.
@@ -100,7 +100,7 @@ class LookRig(NamedTuple):
         """Whether displacements are rigid."""
         return len(self.linear) == len(self.turns)
 
-    def bundle(self, looks: Sequence[Look], E: FloatArray, fixed: int = -1) -> "Bundle":
+    def bundle(self, looks: Sequence[ObjectView], E: FloatArray, fixed: int = -1) -> "Bundle":
         """Least squares of some looks; arguments as of ``Bundle``."""
         s = np.stack([np.asarray(look.s, dtype=np.float64) for look in looks])
         sigma = np.stack([np.full(s.shape[1:3], np.nan) if x.sigma is None else x.sigma for x in looks])
@@ -282,7 +282,7 @@ class BundleFit:
         seen = np.repeat(self.bundle.weight > 0.0, 2)
         return r[0, seen], J[0, seen]
 
-    def moved(self, rig: LookRig, X: FloatArray) -> FloatArray:
+    def moved(self, rig: ObjectViewRig, X: FloatArray) -> FloatArray:
         """Changes (N, c) of what is seen by the errors of a calibration; X : (k, 4) or (B, k, 4) points."""
         weight, looks = self.bundle.weight[..., None], range(len(self.T))
         pixels = np.stack([changes_of(rig.pixels(X @ self.T[look].T)) for look in looks], axis=1)
@@ -306,7 +306,7 @@ class BundleFit:
         root = vectors / np.sqrt(np.maximum(values, _REGULAR)) / size[:, None]
         return np.asarray(root @ root.T)
 
-    def errors(self, rig: LookRig, X: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def errors(self, rig: ObjectViewRig, X: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Errors (p, N) of the minimum by the images that are seen, and (p, c) by the calibration.
 
         Each by independent ones of unit variance; X as for ``moved``.
@@ -314,7 +314,7 @@ class BundleFit:
         by_images = self.inverse_hessian @ self.linearized()[1].T
         return by_images, -by_images @ self.moved(rig, X)
 
-    def points_at(self, look: int, rig: LookRig) -> "UncertainPoints":
+    def points_at(self, look: int, rig: ObjectViewRig) -> "UncertainPoints":
         """Return the points at a look, with their errors."""
         T, (k, p) = self.T[look], (len(self.X), self.linearized()[1].shape[1])
         J = np.zeros((k, 3, p))

@@ -172,7 +172,7 @@ class TaskImages(NamedTuple):
         found = list[FloatArray]()
         for one, H in zip(self.goal.incidences, H_taught, strict=True):
             M = np.concatenate([self.body.M, self.goal.place(one.carrier).M])
-            if not one.shown_by(range(len(M))):
+            if not one.visible_by(range(len(M))):
                 raise WorkFailed(f"incidence {one.name}: nobody has looked where its object is: plan first")
             found.append(points_of(M, one.scene) @ H.T)
         return found

@@ -99,7 +99,7 @@ def test_case_36_a_chessboard_under_speckle_is_found_less_certain(projservo, sha
     known = np.isfinite(table.sigma)
     assert 0.05 < np.median(table.sigma[known]) < 0.2
     for pixels, seen in zip(table.images[:, 0], known[:, 0], strict=True):
-        places = Board.of("chessboard:11x8").places[seen]
+        places = Board.of("chessboard:11x8").grid_points[seen]
         H = cv2.findHomography(places, pixels[seen])[0]
         off = cv2.perspectiveTransform(places[None], H)[0] - pixels[seen]
         assert 0.8 < np.sqrt(np.mean(off**2)) / np.sqrt(np.mean(table.sigma[known] ** 2)) < 1.3
@@ -109,7 +109,7 @@ def test_images_of_a_symmetric_board_calibrate_a_robot(projservo, monkeypatch, t
     """Its first joint turns the board before the cameras, which number it from either end."""
     monkeypatch.chdir(tmp_path)
     rng, board = np.random.default_rng(3), Board.of("chessboard:7x5")
-    places = board.places - board.places.mean(axis=0)
+    places = board.grid_points - board.grid_points.mean(axis=0)
     arm = vars(random_robot("RRR", rng))
     body = np.c_[SQUARE_M * places, np.zeros(len(places)), np.ones(len(places))]
     twists = np.array([revolute((0.1, 0.0, 0.0), (0.1, 0.2, 1.0)), *arm["twists"][1:]])
@@ -138,7 +138,7 @@ class Carrier(Quiet):
     """An arm that carries a board to where it is sent, and shows it to two cameras."""
 
     board = Board.of("charuco:5x4")
-    places = board.places - board.places.mean(axis=0)
+    places = board.grid_points - board.grid_points.mean(axis=0)
     body = np.c_[0.14 * places, np.zeros(len(places)), np.ones(len(places))]
     arm = random_robot("RR", np.random.default_rng(3))
     arm = replace(arm, markers=body, cameras=np.diag([0.25, 0.25, 1.0]) @ arm.cameras)

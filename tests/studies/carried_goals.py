@@ -22,7 +22,7 @@ from projservo_cli.records import WorkFailed
 from projservo_cli.simulation.arm import camera_center
 from projservo_cli.simulation.random_tasks import random_tasks
 from projservo_cli.task.displaced_object import DisplacedObject
-from projservo_cli.task.object_bundle_adjustment import Look
+from projservo_cli.task.object_bundle_adjustment import ObjectView
 from tests.known import configured
 from tests.studies.common import in_two_processes, parser_of, quantiles, rate, written
 from tests.studies.hand_eye_coverage import pose
@@ -172,8 +172,8 @@ def draw(arm, seed, faults=()):
             now[rng.integers(2)] = np.nan
         rows.append(row)
         try:
-            found = DisplacedObject.of(c, range(40, 48), [Look(taught), Look(now)], metric=metric)
-            carried = found.carry(Look(goal))
+            found = DisplacedObject.of(c, range(40, 48), [ObjectView(taught), ObjectView(now)], metric=metric)
+            carried = found.carry(ObjectView(goal))
         except WorkFailed as error:
             row["refused"] = str(error)
             continue

@@ -59,7 +59,9 @@ def covered(draw, whole_side=False):
     while True:
         board = Board("chessboard", int(rng.integers(5, 9)), int(rng.integers(7, 12)))
         H = view_of(rng, rng.uniform(*SQUARES))
-        true = np.c_[board.places - board.places.mean(axis=0), np.ones(len(board.places))] @ H.T
+        true = (
+            np.c_[board.grid_points - board.grid_points.mean(axis=0), np.ones(len(board.grid_points))] @ H.T
+        )
         true = true[:, :2] / true[:, 2:]
         if (true < EDGE).any() or (true > np.array(SIZE) - 1 - EDGE).any():
             continue
@@ -88,7 +90,7 @@ def covered(draw, whole_side=False):
 
 def numberings(board):
     """Numbers of the corners as they are drawn, in each order in which the first square is bright, if any."""
-    drawn_as = np.arange(len(board.places)).reshape(board.shape)
+    drawn_as = np.arange(len(board.grid_points)).reshape(board.shape)
     dark = np.indices(board.shape).sum(axis=0)[:-1, :-1] % 2 == 0
     turns = [k for k in range(4) if np.rot90(drawn_as, k).shape == board.shape]
     bright = [k for k in turns if not np.rot90(dark, k)[0, 0]]

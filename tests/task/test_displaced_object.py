@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from projservo_cli.records import InputError, WorkFailed, changed
 from projservo_cli.task.displaced_object import DisplacedObject
-from projservo_cli.task.object_bundle_adjustment import Look
+from projservo_cli.task.object_bundle_adjustment import ObjectView
 from tests.calibration.simulated_robot import Robot, random_robot, rig
 from tests.metric.test_frame import calibrated
 from tests.samples import displacement, frame, pixels, prismatic, revolute
@@ -40,11 +40,11 @@ def c(arm):
 
 def looks(arm, *motions, X=OBJECT):
     """Exact looks at an object before and after motions (4, 4)."""
-    return [Look(pixels(arm.cameras, X @ T.T)) for T in (np.eye(4), *motions)]
+    return [ObjectView(pixels(arm.cameras, X @ T.T)) for T in (np.eye(4), *motions)]
 
 
 def goal_of(arm, H=AT_GOAL):
-    return Look(pixels(arm.cameras, arm.markers @ H.T))
+    return ObjectView(pixels(arm.cameras, arm.markers @ H.T))
 
 
 @pytest.mark.parametrize(("seed", "types", "views"), [(None, "RRRRRR", 2), (1, "RPRR", 3), (3, "RR", 2)])
@@ -117,8 +117,8 @@ def test_errors_are_those_of_whole_estimates(arm, rng):
     carried = DisplacedObject.of(c, NUMBERS, seen).carry(goal)
 
     def estimate(calibration, noise, of_goal):
-        moved = [Look(look.s + part) for look, part in zip(seen, noise, strict=True)]
-        return DisplacedObject.of(calibration, NUMBERS, moved).carry(Look(goal.s + of_goal)).s
+        moved = [ObjectView(look.s + part) for look, part in zip(seen, noise, strict=True)]
+        return DisplacedObject.of(calibration, NUMBERS, moved).carry(ObjectView(goal.s + of_goal)).s
 
     noise, of_goal = rng.standard_normal((2, 2, 8, 2)), rng.standard_normal(goal.s.shape)
     plain = carried.s
@@ -195,7 +195,7 @@ def test_what_is_not_seen_is_named(X, unseen, code, markers, others, arm, c):
 
 def test_a_marker_that_is_off_by_itself_is_left_out_of_its_look(arm, c):
     taught, now = looks(arm, MOVED)
-    off = Look(now.s + np.where(np.arange(8) == 3, 20.0, 0.0)[:, None], now.sigma)
+    off = ObjectView(now.s + np.where(np.arange(8) == 3, 20.0, 0.0)[:, None], now.sigma)
     found = DisplacedObject.of(c, NUMBERS, [taught, off])
     gone = DisplacedObject.of(c, NUMBERS, [taught, hidden(now, E[:, 3])])
     assert (found.left_out, gone.left_out) == ((43,), ())
@@ -223,19 +223,19 @@ def test_a_tag_that_slipped_by_itself_is_named_before_all_residuals_tell(tag, ar
 
 def test_what_is_no_displaced_object_is_named(arm, c):
     taught, now = looks(arm, MOVED)
-    deformed = Look(now.s + np.where(np.arange(8) >= 5, 40.0, 0.0)[:, None])
+    deformed = ObjectView(now.s + np.where(np.arange(8) >= 5, 40.0, 0.0)[:, None])
     one = refused(c, NUMBERS, [taught, deformed])
     assert (one.code, len({*one.subject.markers} & {*NUMBERS})) == ("object_deformed", 1)
     assert one.amount > one.limit
     few = [
-        Look(np.where(np.arange(8)[:, None] < 6 + (np.arange(2) > 0)[:, None, None], look.s, math.nan))
+        ObjectView(np.where(np.arange(8)[:, None] < 6 + (np.arange(2) > 0)[:, None, None], look.s, math.nan))
         for look in (taught, now)
     ]
     few[0].s[1, :4] = few[1].s[1, :4] = math.nan
     one = refused(c, NUMBERS, few)
     assert (one.code, one.subject.markers, one.subject.poses) == ("object_without_shape", (44, 45), (1,))
     alone = changed(c, P=c.P[:1], view=("left",), sqrt_cov_shared=c.sqrt_cov_shared[12:])
-    one = refused(alone, NUMBERS, [Look(look.s[:1]) for look in (taught, now)])
+    one = refused(alone, NUMBERS, [ObjectView(look.s[:1]) for look in (taught, now)])
     assert one.code == "object_without_size"
     found, goal = DisplacedObject.of(c, NUMBERS, [taught, now]), goal_of(arm)
     with pytest.raises(WorkFailed) as caught:

@@ -17,7 +17,7 @@ from projservo_cli.task.incidence_errors import (
     placed_by,
 )
 from projservo_cli.task.incidences import Incidence
-from projservo_cli.task.object_bundle_adjustment import BundleFit, Look
+from projservo_cli.task.object_bundle_adjustment import BundleFit, ObjectView
 from tests.configured import calibrate, truth_of
 from tests.known import configured
 
@@ -76,7 +76,7 @@ def placed():
     markers = calibration.indices_of(truth.number)
     G = np.linalg.lstsq(truth.M, calibration.M[markers], rcond=None)[0].T
     H_taught, H_now = (G @ one @ np.linalg.inv(G) for one in H)
-    ends = TaughtAndNow(Look(taught, sigma), Look(now, sigma), H_taught, H_now)
+    ends = TaughtAndNow(ObjectView(taught, sigma), ObjectView(now, sigma), H_taught, H_now)
     return calibration, markers, ends, config.markers.lengths(config.face_numbers), truth, H
 
 
@@ -139,7 +139,7 @@ def test_points_of_an_object_change_as_those_fitted_again_do(placed):
     T = np.eye(4)
     T[:3, :3] = Rotation.from_rotvec(0.2 * rng.normal(size=3)).as_matrix()
     T[:3, 3] = middle - T[:3, :3] @ middle + 0.1 * size * rng.normal(size=3)
-    looks = [Look(rig.pixels(X @ at.T)[0], np.full((len(rig.P[0]), 5), 0.3)) for at in (np.eye(4), T)]
+    looks = [ObjectView(rig.pixels(X @ at.T)[0], np.full((len(rig.P[0]), 5), 0.3)) for at in (np.eye(4), T)]
     E = generators(rig.linear, X[:, :3].mean(axis=0))
 
     def fitted(rig, s):

@@ -74,13 +74,13 @@ class _Grid:
         return board_numberings(self.rows, self.columns)
 
     @property
-    def places(self) -> FloatArray:
+    def grid_points(self) -> FloatArray:
         """Places (N, 2) of the corners on the board, in cells."""
         return np.indices((self.rows, self.columns))[::-1].reshape(2, -1).T.astype(np.float64)
 
     def _off(self, image: FloatArray) -> float:
         """Largest distance of corners (N, 2) from a plane grid, over the median cell."""
-        moved = homogeneous(self.places) @ moved_plane(self.places, image).T
+        moved = homogeneous(self.grid_points) @ moved_plane(self.grid_points, image).T
         cell = np.median(np.linalg.norm(np.diff(image.reshape(self.rows, self.columns, 2), axis=1), axis=2))
         return float(np.linalg.norm(moved[:, :2] / moved[:, 2:] - image, axis=1).max() / cell)
 
@@ -89,8 +89,8 @@ class _Grid:
         seen = np.isfinite(image[:, 0])
         if seen.sum() <= 2 * _LEAST_SIDE:
             return np.full((len(self.numberings), 3, 3), np.nan)
-        H = np.linalg.solve(camera, moved_plane(self.places[seen], image[seen]))
-        H *= np.sign(H[2] @ homogeneous(self.places[seen]).mean(axis=0))
+        H = np.linalg.solve(camera, moved_plane(self.grid_points[seen], image[seen]))
+        H *= np.sign(H[2] @ homogeneous(self.grid_points[seen]).mean(axis=0))
         U, _, Vt = np.linalg.svd(H[:, :2], full_matrices=False)
         across = U @ Vt
         R = np.column_stack([across, np.cross(across[:, 0], across[:, 1])])

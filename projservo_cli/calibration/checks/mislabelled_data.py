@@ -208,7 +208,7 @@ def _units(data: _Data) -> Iterator[Relabelling]:
         yield data.with_("joint_unit", data.of_joint(i, name=name), q=q, q_0=q_0)
 
 
-def _late_from(data: _Data) -> Iterator[Relabelling]:
+def _images_shifted_from(data: _Data) -> Iterator[Relabelling]:
     """Images that come one pose late or early against their readings, from a pose on."""
     K = len(data.detections.q)
     tried = even_choice(K, _ONSETS + 2)[1:-1].tolist() if data.onset is None else [data.onset]
@@ -234,7 +234,7 @@ def _sizes(data: _Data) -> Iterator[Relabelling]:
 _NEARER = dict.fromkeys(_SHIFTED, (_Data.dated,)) | {"tracker_memory": (_Data.sharper,) * 3}
 # All relabellings by which the same images may fit: the simple ones first, then those by which more would.
 SIMPLE = (_mounts, _orders_of_images, _types, _standing)
-OTHERS = (_exchanged, _couplings, _parallelograms, _units, _sizes, _late_from, _memories)
+OTHERS = (_exchanged, _couplings, _parallelograms, _units, _sizes, _images_shifted_from, _memories)
 
 
 def relabelled(

@@ -24,7 +24,7 @@ _STEPS, _CLEARER = 6, 2.0
 _EXPLAINS, _OF_NOISE, _MOST_JOINTS, _ORDERED = 0.2, 1.5, 6, 8
 
 
-def shown_poses(solution: Solution, out: BoolArray) -> IntArray:
+def imaged_poses(solution: Solution, out: BoolArray) -> IntArray:
     """Images (P, 3), row of the pose, view and row of the pose that they show; others of that pose are kept.
 
     out : (V, N) rejected detections, most of those of each of these images.
@@ -52,7 +52,7 @@ def shown_poses(solution: Solution, out: BoolArray) -> IntArray:
     return np.array(found, dtype=np.int64).reshape(-1, 3)
 
 
-def on_shown_poses(detections: Detections, shown: IntArray) -> Iterator[Finding]:
+def findings_on_imaged_poses(detections: Detections, shown: IntArray) -> Iterator[Finding]:
     """Findings on images (P, 3) that show other poses, one for each view."""
     for v, name in enumerate(detections.view):
         if (of_view := shown[shown[:, 1] == v]).size:

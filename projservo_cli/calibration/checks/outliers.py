@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 from scipy.spatial import cKDTree
 
 from projservo_cli.calibration.bundle_adjustment import LeastSquares, fit_offsets
-from projservo_cli.calibration.checks.mismatched_poses import EXPLAINED, MOSTLY, SEEN_OF_IMAGE, shown_poses
+from projservo_cli.calibration.checks.mismatched_poses import EXPLAINED, MOSTLY, SEEN_OF_IMAGE, imaged_poses
 from projservo_cli.calibration.checks.model_errors import image_motions
 from projservo_cli.calibration.detections import RAYLEIGH, Detections
 from projservo_cli.calibration.initial.epipolar import OUTLIER
@@ -58,7 +58,7 @@ class Outliers:
         detections, sigma = problem.detections, solution.sigma_px
         out = detections.seen & ~used
         id_switches, explained = _id_switches(problem, params, out, OUTLIER * sigma)
-        shown = shown_poses(solution, out & ~explained)
+        shown = imaged_poses(solution, out & ~explained)
         for k, view, _ in shown:
             explained[view] |= out[view] & (detections.pose_of == k)
         moved = _moved_images(solution, out & ~explained)

@@ -89,7 +89,7 @@ class ImageGeometry(ABC):
     def within(self, detections: Detections, deviations: float) -> BoolArray:
         """Mask (N,) of observations that obey the geometry to some standard deviations."""
 
-    def places(self, detections: Detections) -> BoolArray:
+    def placeable_markers(self, detections: Detections) -> BoolArray:
         """Mask (m,) of markers that ``guesses`` can place; all, unless a class knows some alone."""
         return np.ones(detections.marker.size, dtype=np.bool_)
 

@@ -100,7 +100,7 @@ def stationary(detections: Detections, noise_px: float) -> BoolArray:
 
 def starting_markers(detections: Detections, geometry: ImageGeometry, rng: np.random.Generator) -> BoolArray:
     """Mask (m,) of markers for the start: placed, moving, seen at many poses, and as many as poses need."""
-    m, placed = detections.marker.size, geometry.places(detections)
+    m, placed = detections.marker.size, geometry.placeable_markers(detections)
     moving = placed & ~stationary(detections, geometry.noise_px)
     if m <= _FEW:
         return moving if moving.sum() >= _WANTED else placed

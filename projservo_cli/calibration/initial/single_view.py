@@ -149,7 +149,7 @@ class RigidBody(ImageGeometry):
         """Relative standard error of the noise."""
         return float(1.0 / np.sqrt(2.0 * self.dof))
 
-    def places(self, detections: Detections) -> BoolArray:
+    def placeable_markers(self, detections: Detections) -> BoolArray:
         """Mask (m,) of the markers in the fit."""
         return np.isin(detections.marker, self.marker)
 

@@ -50,7 +50,7 @@ from projservo_cli.task.incidences import (
     images_of,
     points_of,
 )
-from projservo_cli.task.object_bundle_adjustment import NO_POINTS, Look
+from projservo_cli.task.object_bundle_adjustment import NO_POINTS, ObjectView
 from projservo_cli.task.target import TaskImages
 
 # Maximum residual of a body that agrees with its calibration, over the noise, px.
@@ -278,7 +278,7 @@ def _incidence_errors(run: LawRun, images: TaskImages, H: FloatArray, taught: Fl
     objects = plan.carried if isinstance(plan, Plan) else ()
     s, shown = np.full_like(images.s_star, np.nan), run.log.s[run.steps]
     s[:, : shown.shape[1]] = shown  # of a law that measures points those of the face alone
-    now = Look(s, np.full(s.shape[:2], max(world.noise_px, _EXACT_PX)))
+    now = ObjectView(s, np.full(s.shape[:2], max(world.noise_px, _EXACT_PX)))
     found, markers = np.full((4, len(taught)), np.nan), world.calibration.indices_of(world.numbers)
     for carrier in images.goal.carriers:
         own = [k for k, one in enumerate(images.goal.incidences) if one.carrier == carrier]
@@ -287,10 +287,10 @@ def _incidence_errors(run: LawRun, images: TaskImages, H: FloatArray, taught: Fl
             of, sigma = objects[carrier - 1], 0.0
             more = of.goal_deviation_mm or 0.0, of.goal_deviation_deg or 0.0
         goal, asked = (
-            Look(place.s, np.full(s.shape[:2], max(sigma, _EXACT_PX))),
+            ObjectView(place.s, np.full(s.shape[:2], max(sigma, _EXACT_PX))),
             [images.goal.incidences[k] for k in own],
         )
-        shown = all(one.shown_by(range(len(markers))) for one in asked)
+        shown = all(one.visible_by(range(len(markers))) for one in asked)
         points = NO_POINTS if shown else markers_now(world.calibration, objects[carrier - 1])
         ends = TaughtAndNow(goal, now, taught[own[0]], H, *more, points)
         found[:, own] = incidence_errors(world.calibration, markers, asked, ends, world.inputs.lengths)
@@ -328,7 +328,7 @@ def _reason(run: LawRun, joint: int, remaining: tuple[float | None, float | None
     at_step = replace(own, amount=float(steps), unit="1")
     if verdict == "converged":
         yield replace(own, severity=NOTE, limit=within)
-        yield from (*_vague(run), *_apart(run), *_unkept(run, at_step))
+        yield from (*_noisy_markers(run), *_apart(run), *_unkept(run, at_step))
         return
     if verdict == "no progress":
         yield replace(own, others=(run.why or _stalled_by(run),))
@@ -366,7 +366,7 @@ def _grown(run: LawRun, own: Finding, at_step: Finding) -> Finding:
     return replace(at_step, code="not_finite")
 
 
-def _vague(run: LawRun) -> Iterator[Finding]:
+def _noisy_markers(run: LawRun) -> Iterator[Finding]:
     """Tell that markers are seen there with more noise than elsewhere."""
     if run.noise_ratio > _VAGUE:
         yield Finding("vague_markers", LIMITS, amount=run.noise_ratio, limit=_VAGUE)

@@ -40,7 +40,7 @@ from projservo_cli.stages.stage_inputs import CarryingObject, Contract, PlanInpu
 from projservo_cli.stages.worlds.external_robot import opened_robot, path_to
 from projservo_cli.stages.worlds.task_images import given_pixels, task_images
 from projservo_cli.task.body_pose import NO_BODY, Body, make_body
-from projservo_cli.task.object_bundle_adjustment import Look
+from projservo_cli.task.object_bundle_adjustment import ObjectView
 from projservo_cli.task.target import TaskImages, is_stereo
 
 _UNKNOWN = Ends(np.full((4, 4), np.nan), np.full((4, 4), np.nan), np.full(4, np.nan))
@@ -168,27 +168,29 @@ class CalibratedWorld:
         """Return true ends, of goals of incidences with the one nearest to the displacement H (4, 4)."""
         return ends
 
-    def shown(self, images: TaskImages, q_taught: FloatArray | None, seed: int) -> TaskImages:
+    def averaged_images(self, images: TaskImages, q_taught: FloatArray | None, seed: int) -> TaskImages:
         """Start and taught goal as images of a seed show them, which are averages.
 
         q_taught : (n,) joints at which the goal was taught, if they are known.
         """
         return images
 
-    def look(
+    def observe_object(
         self, carrier: CarryingObject, session: Session | None, ends: TaskImages, q_taught: FloatArray | None
-    ) -> tuple[Look, Look]:
+    ) -> tuple[ObjectView, ObjectView]:
         """Images of an object when the goal was taught, and now.
 
         session : connection to the robot that looks where it stands; None for one of its own.
         q_taught : (n,) joints at which the goal was taught, if they are known.
         """
-        now = self._look_now(carrier, session, ends.q_start)
+        now = self._observed_now(carrier, session, ends.q_start)
         if carrier.taught is None:
-            return self._look_before(carrier, q_taught), now
-        return Look(*given_pixels(carrier.taught, carrier.numbers, (), self.view)), now
+            return self._observed_before(carrier, q_taught), now
+        return ObjectView(*given_pixels(carrier.taught, carrier.numbers, (), self.view)), now
 
-    def _look_now(self, carrier: CarryingObject, session: Session | None, q_start: FloatArray) -> Look:
+    def _observed_now(
+        self, carrier: CarryingObject, session: Session | None, q_start: FloatArray
+    ) -> ObjectView:
         """Images of an object by the robot where it stands, or by a simulated one at the start (n,)."""
         assert carrier.driven is not None
         rest = carrier.rest
@@ -202,9 +204,9 @@ class CalibratedWorld:
 
             _, mean, sigma, *_ = seen_at_rest(robot, observe, rest.averaged_frames, rest.settle_s, "plan")
         which = [len(self.observed) + carrier.driven.further.index(number) for number in carrier.numbers]
-        return Look(mean.s[:, which], sigma[:, which])
+        return ObjectView(mean.s[:, which], sigma[:, which])
 
-    def _look_before(self, carrier: CarryingObject, q_taught: FloatArray | None) -> Look:
+    def _observed_before(self, carrier: CarryingObject, q_taught: FloatArray | None) -> ObjectView:
         """Images of an object when the goal was taught, of which none were kept; of simulated ones alone."""
         raise InputError(f"task.goal does not show where {carrier.name} was: teach it again, projservo teach")
 

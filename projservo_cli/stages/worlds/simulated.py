@@ -48,7 +48,7 @@ from projservo_cli.stages.worlds.task_images import positioned, task_images
 from projservo_cli.task.body_pose import make_body
 from projservo_cli.task.face import center_of
 from projservo_cli.task.incidences import incidences_of, nearest_goal, points_of
-from projservo_cli.task.object_bundle_adjustment import Look
+from projservo_cli.task.object_bundle_adjustment import ObjectView
 from projservo_cli.task.stand_off import displacement_back
 from projservo_cli.task.target import TaskImages
 
@@ -127,7 +127,7 @@ class SimulatedWorld(CalibratedWorld):
         pose = (np.linalg.inv(H) if on_tool else H) @ ends.base_tool
         return Ends(ends.base_tool, pose, H @ np.array(center_of(plant.M, plant.center)))
 
-    def shown(self, images: TaskImages, q_taught: FloatArray | None, seed: int) -> TaskImages:
+    def averaged_images(self, images: TaskImages, q_taught: FloatArray | None, seed: int) -> TaskImages:
         """Start and taught goal with the noise of a seed; given images of the goal stay as they are."""
         sigma = self.inputs.noise.at_rest_px
         if sigma == 0.0:
@@ -142,20 +142,22 @@ class SimulatedWorld(CalibratedWorld):
             s[:drawn, :, m:] += sigma * noise[:, :, which]
         return images._replace(s_start=s[0]).to(s[1])
 
-    def _look_now(self, carrier: CarryingObject, session: Session | None, q_start: FloatArray) -> Look:
+    def _observed_now(
+        self, carrier: CarryingObject, session: Session | None, q_start: FloatArray
+    ) -> ObjectView:
         assert carrier.placed is not None
         return self._object(carrier.placed, OBJECT_NOW, carrier.placed.T)
 
-    def _look_before(self, carrier: CarryingObject, q_taught: FloatArray | None) -> Look:
+    def _observed_before(self, carrier: CarryingObject, q_taught: FloatArray | None) -> ObjectView:
         assert carrier.placed is not None
         return self._object(carrier.placed, OBJECT_TAUGHT, np.eye(4))
 
-    def _object(self, placed: SceneObject, stream: int, T: FloatArray) -> Look:
+    def _object(self, placed: SceneObject, stream: int, T: FloatArray) -> ObjectView:
         """Images of an object displaced by T (4, 4) since the goal was taught."""
         s = placed.images(self.truth, T)
         noise = self.inputs.noise.at_rest_px
         s += noise * self.truth.noise.draw(generator(self.inputs.seed, stream), s.shape)
-        return Look(s, np.full(s.shape[:2], noise) if noise > 0.0 else None)
+        return ObjectView(s, np.full(s.shape[:2], noise) if noise > 0.0 else None)
 
     def metric_model(self, law: str) -> Model:
         """Return the true model."""
@@ -245,7 +247,7 @@ class RenderedWorld(SimulatedWorld):
         """Standard deviation of a coordinate of images in the loop, px."""
         return max(self.inputs.noise.servo_px, self.calibration.fit.sigma_fitted_px)
 
-    def shown(self, images: TaskImages, q_taught: FloatArray | None, seed: int) -> TaskImages:
+    def averaged_images(self, images: TaskImages, q_taught: FloatArray | None, seed: int) -> TaskImages:
         """Start and goal as rendered frames show them; images of the goal that are given stay as they are.
 
         The body is fitted to both by the deviations of their pixels, whichever is the larger. Markers of the
@@ -303,21 +305,23 @@ class RenderedWorld(SimulatedWorld):
             "little else of the tool: turn it towards the cameras, or bring it nearer"
         )
 
-    def _look_now(self, carrier: CarryingObject, session: Session | None, q_start: FloatArray) -> Look:
+    def _observed_now(
+        self, carrier: CarryingObject, session: Session | None, q_start: FloatArray
+    ) -> ObjectView:
         return self._object_frames(carrier, self.scene, q_start, OBJECT_NOW)
 
-    def _look_before(self, carrier: CarryingObject, q_taught: FloatArray | None) -> Look:
+    def _observed_before(self, carrier: CarryingObject, q_taught: FloatArray | None) -> ObjectView:
         assert carrier.at_first is not None
         assert q_taught is not None
         return self._object_frames(carrier, carrier.at_first, q_taught, OBJECT_TAUGHT)
 
     def _object_frames(
         self, carrier: CarryingObject, scene: RenderedScene, q: FloatArray, stream: int
-    ) -> Look:
+    ) -> ObjectView:
         """Images of an object in a scene, with the arm at joints (n,)."""
         which = [scene.numbers.index(number) for number in carrier.numbers]
         s, sigma = observed_in_frames(scene, self.inputs.noise.averaged_frames, q, (self.inputs.seed, stream))
-        return Look(s[:, which], sigma[:, which])
+        return ObjectView(s[:, which], sigma[:, which])
 
 
 def _point_velocities(M: FloatArray, motions: FloatArray) -> FloatArray:
