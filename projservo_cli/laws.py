@@ -101,8 +101,13 @@ LAW_SPECS = {
 LAWS = tuple(LAW_SPECS)
 CODES = {law: code for code, law in enumerate(LAWS)}  # codes of the laws in compiled code
 PAPER_LAWS = tuple(law for law, spec in LAW_SPECS.items() if spec.paper)
-POINT_LAWS = tuple(law for law, spec in LAW_SPECS.items() if spec.family is Family.CLASSICAL)
-BODY_LAWS = tuple(law for law, spec in LAW_SPECS.items() if spec.family is not Family.CLASSICAL)
+# Laws of the field and those of the projective calibration, which figures and the animation compare.
+CLASSICAL_LAWS = tuple(law for law, spec in LAW_SPECS.items() if spec.family is Family.CLASSICAL)
+PROJECTIVE_LAWS = tuple(law for law in LAWS if law not in CLASSICAL_LAWS)
+# Laws that measure the points of the face themselves, and laws that can measure the face with its whole body.
+FACE_LAWS, BODY_LAWS = CLASSICAL_LAWS, PROJECTIVE_LAWS
+# Laws that fail the call by default if they do not converge; a classical law may end in any verdict.
+CONVERGING_LAWS = PROJECTIVE_LAWS
 _NAMES = {
     f"{law}_{mode}": (law, mode) for law, spec in LAW_SPECS.items() for mode in spec.modes if mode != REGULATE
 }
@@ -115,7 +120,12 @@ def title_of(law: str) -> str:
 
 def must_converge(law: str, required: Sequence[str] | None) -> bool:
     """Tell whether a law that does not converge fails the call: by default all but classical ones."""
-    return law not in POINT_LAWS if required is None else law in required
+    return law in CONVERGING_LAWS or law not in LAWS if required is None else law in required
+
+
+def fault_fails(law: str) -> bool:
+    """Tell whether a fault that ends a run fails the call: classical laws lead where images mean nothing."""
+    return law not in CLASSICAL_LAWS
 
 
 def run_name(law: str, mode: str) -> str:

@@ -15,7 +15,7 @@ from projservo_cli import records
 from projservo_cli.cli import main
 from projservo_cli.cli.equations import REGISTER
 from projservo_cli.config.schema import json_schema, sweep_schema
-from projservo_cli.laws import INCIDENCES, LAW_SPECS, MODES, POINT_LAWS
+from projservo_cli.laws import FACE_LAWS, INCIDENCES, LAW_SPECS, MODES
 from projservo_cli.loop import verdicts as loop_verdicts
 from projservo_cli.messages import ROWS
 from projservo_cli.messages.verdicts import VERDICTS
@@ -130,7 +130,7 @@ def laws() -> Iterator[str]:
     """The control laws with their formulas, what each measures, and its source."""
     rows = []
     for name, law in LAW_SPECS.items():
-        measures = "face" if name in POINT_LAWS else "body, always" if name == INCIDENCES else "body"
+        measures = "face" if name in FACE_LAWS else "body, always" if name == INCIDENCES else "body"
         rows.append((f"`{name}`", law.family.value, law.velocity, measures, law.source))
     yield from table(("law", "family", "joint velocity", "measures", "source"), rows)
 

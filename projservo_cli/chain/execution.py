@@ -16,7 +16,7 @@ from projservo_cli.chain.task_steps import Steps
 from projservo_cli.config import Config, load_config, stored_yaml
 from projservo_cli.config.inputs import about_of, scenery_of, suggestion_inputs
 from projservo_cli.findings import Finding
-from projservo_cli.laws import CODES, POINT_LAWS, codes_of, law_and_mode, must_converge, run_name
+from projservo_cli.laws import CODES, codes_of, fault_fails, law_and_mode, must_converge, run_name
 from projservo_cli.loop.jit_notice import compilation
 from projservo_cli.messages import failed, sentence_and_remedy
 from projservo_cli.messages.verdicts import arrived, meaning
@@ -326,8 +326,7 @@ class Chain:
                     f"; {trace.overruns} of {trace.steps} periods took longer than {trace.period:g} s: where "
                     "many do, raise control.period_s, or find fewer markers"
                 )
-            # Classical laws lead where nothing can be expected of them, images included.
-            disturbed = meaning(trace.verdict).refutes and trace.law not in POINT_LAWS
+            disturbed = meaning(trace.verdict).refutes and fault_fails(trace.law)
             yield _Shortfall(text, fatal=not converged and (must or disturbed))
 
     def _keep(self, run: Run) -> None:

@@ -12,7 +12,7 @@ from markupsafe import Markup
 
 from projservo_cli.geometry.kinematics import forward_kinematics
 from projservo_cli.image_size import ImageSize, image_sizes
-from projservo_cli.laws import BODY_LAWS, POINT_LAWS
+from projservo_cli.laws import CLASSICAL_LAWS, PROJECTIVE_LAWS
 from projservo_cli.messages.verdicts import arrived
 from projservo_cli.records import BoolArray, ByteArray, FloatArray, InputError, IntArray, Plan, Trace
 from projservo_cli.report import style
@@ -356,8 +356,8 @@ def write_animation(
     """
     from PIL import Image
 
-    direct = [name for name in traces if name in BODY_LAWS]
-    pair = [*direct[:1], *(name for name in traces if name in POINT_LAWS)]
+    direct = [name for name in traces if name in PROJECTIVE_LAWS]
+    pair = [*direct[:1], *(name for name in traces if name in CLASSICAL_LAWS)]
     columns = {name: traces[name] for name in (pair if len(pair) > 1 else [*traces])[:_MOST_COLUMNS]}
     sizes = image_sizes(size, next(iter(traces.values())).view)
     if size is None:

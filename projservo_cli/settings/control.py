@@ -8,7 +8,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, WithJsonSchema
 from pydantic_core import PydanticCustomError
 
 from projservo_cli import plugins
-from projservo_cli.laws import BODY_LAWS, LAWS, PAPER_LAWS, mode_in
+from projservo_cli.laws import CONVERGING_LAWS, LAWS, PAPER_LAWS, mode_in
 from projservo_cli.settings.sections import Note, Positive, Section, Whole
 
 
@@ -70,7 +70,7 @@ class LawChoice(Section):
     must_converge: tuple[_Law, ...] | None = Field(
         None,
         description="laws that fail the call (exit code 1) if they do not converge; null: "
-        f"{', '.join(BODY_LAWS)} and plug-in laws",
+        f"{', '.join(CONVERGING_LAWS)} and plug-in laws",
     )
 
 

@@ -7,7 +7,7 @@ import textwrap
 import numpy as np
 
 from projservo_cli.geometry.kinematics import project
-from projservo_cli.laws import BODY_LAWS, PAPER_LAWS, POINT_LAWS, title_of
+from projservo_cli.laws import CLASSICAL_LAWS, PAPER_LAWS, PROJECTIVE_LAWS, title_of
 from projservo_cli.loop.verdicts import plateau_stretches
 from projservo_cli.records import CORNERS, ByteArray, FloatArray, IncidenceHistory, IntArray, Trace
 from projservo_cli.report import panels, style
@@ -15,7 +15,7 @@ from projservo_cli.report.figure_inputs import DIRECT, Data, Driven, ReportData,
 from projservo_cli.task.face import cyclic_order
 
 # Classical laws of the paper; those of others are among every run.
-_CLASSICAL = tuple(law for law in PAPER_LAWS if law in POINT_LAWS)
+_CLASSICAL = tuple(law for law in PAPER_LAWS if law in CLASSICAL_LAWS)
 _PANELS_WIDTH, _PANEL_WIDTH = 5.8, 3.6  # inches, of all panels side by side, and of one at most
 _PATH = style.line(style.BLACK, width=0.9, label="path of a marker")
 _PLATEAU = style.line(style.VERMILION, width=2.0, marker="s", label="plateau of the error")
@@ -291,7 +291,7 @@ def frames_of_run(
 def _runs_with(report_data: Driven | ReportData, part: str) -> list[tuple[str, Trace]]:
     """Names and traces of the runs that have a part, first those of the direct laws."""
     runs = [run for run in report_data.traces.items() if getattr(run[1], part) is not None]
-    return sorted(runs, key=lambda run: run[0] not in BODY_LAWS)
+    return sorted(runs, key=lambda run: run[0] not in PROJECTIVE_LAWS)
 
 
 def _filmed(report_data: Driven | ReportData) -> bool:
