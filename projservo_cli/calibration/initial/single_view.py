@@ -8,14 +8,11 @@ C. Tomasi, T. Kanade, "Shape and motion from image streams under orthography", I
 [HZ04] is R. Hartley, A. Zisserman, "Multiple View Geometry in Computer Vision", 2nd ed., 2004.
 """
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import least_squares
-from scipy.sparse import csr_array
 from scipy.spatial.transform import Rotation
 
 from projservo_cli.calibration.detections import (
@@ -59,10 +56,12 @@ _PLANE = 0.02
 _PLANES_TRIED = 3
 # Tilts of these planes, rad.
 _TILTS = np.radians([15.0, 30.0, 45.0, 60.0, 72.0])
-# Evaluations of the images by a rough fit and by a full one, of the few best; precision of a linear step.
-_ROUGHLY, _EVALUATIONS, _FEW, _PRECISE = 8, 60, 3, 1e-12
+# Steps of a rough fit and of a full one, of the few best; fall of the cost that ends it, and damping.
+_ROUGHLY, _FULLY, _FEW, _PRECISE, _HOPELESS = 20, 100, 3, 1e-10, 1e8
 # Expected relative deviations of aspect and middle of the image, the latter over the focal length.
 _ASPECT, _MIDDLE = 0.01, 0.1
+# Roots of the weights of ``_State.g`` at a unit width of the loss, which is two deviations.
+_PRIOR = 0.5 * np.array([0.0, 1.0 / _ASPECT, 1.0 / _MIDDLE, 1.0 / _MIDDLE])
 # Cost over the best one up to which another focal length or reflection is a start too.
 _AS_LIKELY = 4.0
 # Number of intrinsic parameters: logarithm of the focal length, aspect, and the middle of the image.
@@ -223,7 +222,7 @@ def _explaining(
     def fitted(starts: list[_Start], count: int) -> list[_Body]:
         """Fit the best few of many starts."""
         rough = _all_fitted(images, weight, starts, middle, _ROUGHLY)[:count]
-        return _all_fitted(images, weight, [body.start for body in rough], middle, _EVALUATIONS)
+        return _all_fitted(images, weight, [body.start for body in rough], middle, _FULLY)
 
     bodies = fitted(_flat_starts(images, focals, middle, _PLANE), _FEW)
     bodies = bodies or fitted(_deep_starts(images, focals, middle), _FEW)
@@ -414,100 +413,157 @@ def _all_fitted(
     weight: FloatArray,
     starts: Sequence[_Start],
     middle: FloatArray,
-    evaluations: int,
+    steps: int,
 ) -> list[_Body]:
     """Fits from starts that keep the body in front of the camera, best first."""
-    found = [_fitted(images, weight, start, middle, evaluations) for start in starts]
+    found = [_fitted(images, weight, start, middle, steps) for start in starts]
     return sorted((body for body in found if body is not None), key=lambda body: body.cost)
 
 
 def _fitted(
-    images: FloatArray, weight: FloatArray, start: _Start, middle: FloatArray, evaluations: int
+    images: FloatArray, weight: FloatArray, start: _Start, middle: FloatArray, steps: int
 ) -> _Body | None:
     """Fit body, poses and camera to images (K, m, 2) under a Cauchy loss; None if points fall behind it.
 
-    weight : (K, m) of the residuals.
+    weight : (K, m) of the residuals; steps : maximum number for each of two widths of the loss.
     """
-    R, t, X, focal = start
-    k, j = np.nonzero(np.isfinite(images[..., 0]))
-    seen, (K, m), N, w = images[k, j], images.shape[:2], len(k), weight[k, j][:, None]
-    unit = float(np.linalg.norm(t, axis=1).mean())
-    ends = np.cumsum([_INTRINSICS, 3 * K, 3 * K])
-    prior = np.array([0.0, 1.0 / _ASPECT, 1.0 / _MIDDLE, 1.0 / _MIDDLE])
+    unit = float(np.linalg.norm(start.t, axis=1).mean())
+    state = _State(np.zeros(_INTRINSICS), start.R, start.t / unit, start.X / unit)
+    problem = _Images.of(images, weight, start.focal, middle)
+    with np.errstate(all="ignore"):  # of points in the plane of the camera
+        for _ in range(2):  # the width of the loss follows the residuals
+            off = np.abs(problem.residual(state))
+            if not np.isfinite(off).all():
+                return None
+            state = problem.fitted(state, 2.0 * max(float(np.median(off)) / MAD, MIN_SIGMA), steps)
+    off, Y = problem.residual(state), problem.placed(state)
+    if not np.isfinite(off).all() or (Y[:, 2] <= 0.0).any():
+        return None
+    cost = float(np.median(np.linalg.norm(off, axis=1)))
+    shift = middle + start.focal * state.g[2:]
+    return _Body(state.R, state.t, state.X, problem.focal(state), shift, cost, off)
 
-    def placed(x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Focal lengths, rotations, turned and placed points, and pixels."""
-        g, turns, places, shape = np.split(x, ends)
-        E = Rotation.from_rotvec(turns.reshape(K, 3)).as_matrix() @ R
-        turned = (E[k] @ shape.reshape(m, 3)[j][..., None])[..., 0]
-        Y = turned + places.reshape(K, 3)[k]
-        f = focal * np.exp(g[0]) * np.array([1.0, np.exp(g[1])])
-        return f, E, turned, Y, f * Y[:, :2] / Y[:, 2:] + middle + focal * g[2:]
 
-    def residual(x: FloatArray) -> FloatArray:
-        """Weighted predicted minus seen pixels, then the priors of the camera."""
-        return np.concatenate([(w * (placed(x)[-1] - seen)).ravel(), prior * x[:_INTRINSICS]])
+class _State(NamedTuple):
+    """Unknowns of a body before a camera."""
 
-    columns = [
-        np.broadcast_to(np.arange(_INTRINSICS), (N, _INTRINSICS)),
-        *(first + 3 * of[:, None] + np.arange(3) for first, of in zip(ends, (k, k, j), strict=True)),
-    ]
-    where = np.concatenate(
-        [np.repeat(np.concatenate(columns, axis=1), 2, axis=0).ravel(), np.arange(_INTRINSICS)]
-    )
-    width = _INTRINSICS + 9
-    rows = np.concatenate([np.repeat(np.arange(2 * N), width), 2 * N + np.arange(_INTRINSICS)])
+    g: FloatArray  # (4,) logarithms of focal length and aspect, and shift of the middle over the focal length
+    R: FloatArray  # (K, 3, 3) rotations
+    t: FloatArray  # (K, 3) places
+    X: FloatArray  # (m, 3) shape
 
-    def derivative(x: FloatArray) -> csr_array:
-        """Derivative of the residual."""
-        f, E, turned, Y, _ = placed(x)
+    def moved(self, camera: FloatArray, poses: FloatArray, shape: FloatArray) -> "_State":
+        """State after a step of the camera (4,), of turns and places (K, 6), and of the shape (m, 3)."""
+        turn = Rotation.from_rotvec(poses[:, :3]).as_matrix()
+        return _State(self.g + camera, turn @ self.R, self.t + poses[:, 3:], self.X + shape)
+
+
+class _Normal(NamedTuple):
+    """Normal equations of camera and shape, of the poses, and between them."""
+
+    A: FloatArray  # (4 + 3 m, 4 + 3 m)
+    B: FloatArray  # (K, 6, 4 + 3 m)
+    D: FloatArray  # (K, 6, 6)
+    a: FloatArray  # (4 + 3 m,) gradient
+    d: FloatArray  # (K, 6)
+
+    def step(self, damping: float) -> tuple[FloatArray, FloatArray]:
+        """Damped step of camera and shape (4 + 3 m,), and of the poses (K, 6), which are eliminated."""
+        factor = 1.0 + damping
+        D = np.where(np.eye(6, dtype=bool), factor * self.D + 1e-12, self.D)
+        A = np.where(np.eye(len(self.A), dtype=bool), factor * self.A + 1e-12, self.A)
+        solved = np.linalg.solve(D, np.concatenate([self.B, self.d[..., None]], axis=2))
+        flat = self.B.reshape(-1, len(A))
+        left = A - flat.T @ solved[..., :-1].reshape(-1, len(A))
+        x = -np.linalg.solve(left, self.a - flat.T @ solved[..., -1].ravel())
+        return np.asarray(x), np.asarray(-solved[..., -1] - solved[..., :-1] @ x)
+
+
+class _Images(NamedTuple):
+    """Images (N, 2) of a body by one camera, and priors of the camera."""
+
+    k: IntArray  # (N,) pose
+    j: IntArray  # (N,) marker
+    seen: FloatArray  # (N, 2) px
+    weight: FloatArray  # (N, 1)
+    f: float  # focal length that the logarithm is from, px
+    middle: FloatArray  # (2,) px
+
+    @classmethod
+    def of(cls, images: FloatArray, weight: FloatArray, f: float, middle: FloatArray) -> "_Images":
+        """Return the images (K, m, 2) that were seen, with weights (K, m)."""
+        k, j = np.nonzero(np.isfinite(images[..., 0]))
+        return cls(k, j, images[k, j], weight[k, j][:, None], f, middle)
+
+    def focal(self, state: _State) -> FloatArray:
+        """Focal lengths (2,) of u and v, px."""
+        return np.asarray(self.f * np.exp(state.g[0]) * np.array([1.0, np.exp(state.g[1])]))
+
+    def placed(self, state: _State) -> FloatArray:
+        """Points (N, 3) before the camera."""
+        return np.asarray((state.R[self.k] @ state.X[self.j][..., None])[..., 0] + state.t[self.k])
+
+    def residual(self, state: _State) -> FloatArray:
+        """Weighted predicted minus seen pixels (N, 2)."""
+        Y = self.placed(state)
+        pixels = self.focal(state) * Y[:, :2] / Y[:, 2:] + self.middle + self.f * state.g[2:]
+        return np.asarray(self.weight * (pixels - self.seen))
+
+    def cost(self, state: _State, width: float) -> float:
+        """Cauchy loss of a width, px, with the priors of the camera; NaN at infinity."""
+        loss = width**2 * float(np.log1p(np.square(self.residual(state) / width)).sum())
+        return loss + float(np.square(width * _PRIOR * state.g).sum())
+
+    def normal(self, state: _State, width: float) -> _Normal:
+        """Normal equations of the residuals, weighted as the Cauchy loss does."""
+        f, Y, r = self.focal(state), self.placed(state), self.residual(state)
+        (K, m), N = (len(state.R), len(state.X)), len(Y)
+        root = self.weight * np.sqrt(cauchy_weights(np.square(r / width)))
         D = np.zeros((N, 2, 3))
         D[:, 0, 0], D[:, 1, 1] = f[0] / Y[:, 2], f[1] / Y[:, 2]
         D[:, :, 2] = -f * Y[:, :2] / Y[:, 2:] ** 2
         by_camera = np.zeros((N, 2, _INTRINSICS))
         by_camera[..., 0] = f * Y[:, :2] / Y[:, 2:]
         by_camera[:, 1, 1] = by_camera[:, 1, 0]
-        by_camera[:, 0, 2] = by_camera[:, 1, 3] = focal
-        by_turn = -D @ cross_matrix(turned) @ _left_jacobian(x[ends[0] : ends[1]].reshape(K, 3))[k]
-        blocks = w[..., None] * np.concatenate([by_camera, by_turn, D, D @ E[k]], axis=2)
-        return csr_array(
-            (np.concatenate([blocks.ravel(), prior]), (rows, where)), shape=(2 * N + _INTRINSICS, len(x))
-        )
+        by_camera[:, 0, 2] = by_camera[:, 1, 3] = self.f
+        by_turn = -D @ cross_matrix(Y - state.t[self.k])
+        by_pose = root[..., None] * np.concatenate([by_turn, D], axis=2)
+        J = np.zeros((N, 2, _INTRINSICS + 3 * m))
+        J[..., :_INTRINSICS] = root[..., None] * by_camera
+        own = _INTRINSICS + 3 * self.j[:, None, None] + np.arange(3)
+        np.put_along_axis(J, np.broadcast_to(own, (N, 2, 3)), root[..., None] * (D @ state.R[self.k]), axis=2)
+        r = r * root / self.weight
+        edges = np.searchsorted(self.k, np.arange(K))
+        own = np.concatenate([by_pose, r[..., None]], axis=2)
+        across = np.add.reduceat(by_pose.swapaxes(1, 2) @ own, edges)
+        flat = J.reshape(2 * N, -1)
+        A, a = flat.T @ flat, flat.T @ r.ravel()
+        prior = np.arange(_INTRINSICS)
+        A[prior, prior] += (width * _PRIOR) ** 2
+        a[:_INTRINSICS] += (width * _PRIOR) ** 2 * state.g
+        B = np.stack([by_pose[at].reshape(-1, 6).T @ J[at].reshape(-1, len(a)) for at in self._rows(edges)])
+        return _Normal(A, B, across[..., :-1], a, across[..., -1])
 
-    x = np.concatenate([np.zeros(_INTRINSICS + 3 * K), t.ravel() / unit, X.ravel() / unit])
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # of points in the plane of the camera
-        if not np.isfinite(residual(x)).all():
-            return None
-        for _ in range(2):  # the width of the loss follows the residuals
-            width_px = max(float(np.median(np.abs(residual(x)[: 2 * N]))) / MAD, MIN_SIGMA)
-            found = least_squares(
-                residual,
-                x,
-                derivative,
-                loss="cauchy",
-                f_scale=2.0 * width_px,
-                x_scale="jac",
-                tr_solver="lsmr",
-                tr_options={"maxiter": 2000, "atol": _PRECISE, "btol": _PRECISE},
-                ftol=1e-10,
-                xtol=1e-10,
-                max_nfev=evaluations,
-            )
-            x = found.x
-    f, E, _, Y, pixels = placed(x)
-    if not np.isfinite(pixels).all() or (Y[:, 2] <= 0.0).any():
-        return None
-    places, shape = x[ends[1] : ends[2]].reshape(K, 3), x[ends[2] :].reshape(m, 3)
-    off = w * (pixels - seen)
-    cost = float(np.median(np.linalg.norm(off, axis=1)))
-    return _Body(E, places, shape, f, middle + focal * x[2:_INTRINSICS], cost, off)
+    def _rows(self, edges: IntArray) -> list[slice]:
+        """Observations of each pose, which come one after the other."""
+        return [slice(*pair) for pair in zip(edges, [*edges[1:], len(self.k)], strict=True)]
 
-
-def _left_jacobian(w: FloatArray) -> FloatArray:
-    """Derivatives (K, 3, 3) of rotations by their vectors (K, 3), as turns before them."""
-    W = cross_matrix(w)
-    angle = np.linalg.norm(w, axis=1)[:, None, None]
-    a = 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2
-    b = np.where(angle > 1e-4, (1.0 - np.sinc(angle / np.pi)) / np.maximum(angle, 1e-4) ** 2, 1.0 / 6.0)
-    return np.asarray(np.eye(3) + a * W + b * (W @ W))
+    def fitted(self, state: _State, width: float, steps: int) -> _State:
+        """Minimize the loss of a width, px, by the method of Levenberg and Marquardt."""
+        cost, damping, here = self.cost(state, width), 1e-3, None
+        for _ in range(steps):
+            here = here or self.normal(state, width)
+            try:
+                x, poses = here.step(damping)
+            except np.linalg.LinAlgError:
+                break
+            candidate = state.moved(x[:_INTRINSICS], poses, x[_INTRINSICS:].reshape(-1, 3))
+            new_cost = self.cost(candidate, width)
+            if new_cost <= cost:
+                settled = cost - new_cost <= _PRECISE * cost
+                state, cost, here, damping = candidate, new_cost, None, max(0.1 * damping, 1e-9)
+            else:
+                damping, settled = 10.0 * damping, damping > _HOPELESS
+            if settled:
+                break
+        return state
