@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from projservo_cli.calibration.detections import require_size_and_noise
+from projservo_cli.geometry.flange import FLANGE_TYPES
 from projservo_cli.image_size import ImageSize
 from projservo_cli.records import TOOL, VIEWS, WORLD, InputError, Observation
 from projservo_cli.settings.sections import is_view
@@ -66,6 +67,8 @@ class Observations(Displayable, Observation):
         """Return the observations of a record, with further properties."""
         fields = {field.name: getattr(observation, field.name) for field in dataclasses.fields(Observation)}
         types = properties.pop("joint_types", None) or "R" * observation.q.shape[1]
+        if observation.flange_chart is not None:  # coordinates of a pose have one order
+            types, properties = FLANGE_TYPES, properties | {"order_stated": True}
         return cls(**fields, joint_types=types, **properties)
 
     @classmethod

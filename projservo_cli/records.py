@@ -408,6 +408,10 @@ class Observation:
         "pose view marker", "px", "standard deviation of the pixels, per coordinate, NaN if unseen"
     )
     view: tuple[str, ...] = _scalar(about="names of the views", default=VIEWS)
+    flange_chart: FloatArray | None = _optional_array(
+        "flange_part row coordinate",
+        about="of poses of the flange, whose coordinates q are: axes of turns, and the pose at zero, m",
+    )
 
     @classmethod
     def of_one(
@@ -467,6 +471,10 @@ class CalibratedArm(RecordPart):
         "joint_curve_motion joint_curve_part coordinate",
         about="arm by which torques are known: of each joint its twist over a weight on its axis, at last "
         "gravity in the first row over the weight at the tool",
+    )
+    flange_chart: FloatArray | None = _optional_array(
+        "flange_part row coordinate",
+        about="of poses of the flange, whose coordinates are joints: axes of turns, and the pose at zero, m",
     )
 
     @property
@@ -568,6 +576,9 @@ class FitQuality(RecordPart):
     )
     sigma_q_interval: FloatArray | None = _optional_array(
         "limit", "rad", "95 % interval of sigma_q, if estimated"
+    )
+    sigma_flange_m: float | None = _optional_scalar(
+        "m", "standard deviation of positions of the flange; sigma_q is that of its rotations"
     )
     encoder_counts: bool = _scalar(about="whether sigma_q is that of encoder counts", default=False)
     poses_used: int = _scalar(about="number of poses in the fit")
@@ -1357,3 +1368,4 @@ class JointList:
     q: FloatArray  # (K, n) readings, rad or m
     numbered: bool  # whether the file has pose numbers
     images: dict[str, tuple[str, ...]] | None = None  # of each view, the names of its images at each pose
+    flange_chart: FloatArray | None = None  # (2, 4, 4) of poses of the flange, whose coordinates are ``q``

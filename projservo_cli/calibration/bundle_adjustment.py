@@ -43,6 +43,8 @@ def _generators(params: Parameters) -> list[FloatArray]:
     H_hat, prismatic = params.H_hat, params.prismatic
     center = params.M[:, :3].mean(axis=0)
     size = float(np.linalg.norm(params.M[:, :3] - center, axis=1).mean()) or 1.0
+    if params.known_arm:
+        return [np.zeros((0, 4, 4))] * len(H_hat)
     w = np.where(prismatic[:, None], H_hat[:, :3, 3], _axis_of(H_hat))
     w = w / np.linalg.norm(w, axis=1, keepdims=True)
     # Two unit vectors across w, from the coordinate axis farthest from it so that neither is short.
@@ -86,6 +88,7 @@ class LeastSquares:
     # (n,) noise of joint readings over that of pixels, rad/px or m/px; None where readings are exact
     tau: FloatArray | None = None
     curve_terms: int = 0  # number of terms of the curve of the joints
+    by_twist: FloatArray | None = None  # (K, n, n) of ``q`` by a twist of the flange; None for joints
 
     @classmethod
     def of(
@@ -94,10 +97,11 @@ class LeastSquares:
         """Problem of fitting detections about the reference joints (n,), rad or m.
 
         12 parameters a camera, 4 a revolute and 2 a prismatic joint, 3 a marker, ``lens_terms`` a lens, and
-        ``curve_terms``.
+        ``curve_terms``. The operators of poses of the flange are known.
         """
-        V = len(detections.seen)
-        joint = V * CAMERA + np.concatenate([[0], np.cumsum(np.where(detections.prismatic, 2, 4))])
+        V, known = len(detections.seen), detections.chart is not None
+        of_joints = np.where(detections.prismatic, 2, 4) * (not known)
+        joint = V * CAMERA + np.concatenate([[0], np.cumsum(of_joints)])
         count = lens_terms
         shared = int(joint[-1]) + V * count + curve_terms
         view = np.arange(V)[:, None]
@@ -110,7 +114,8 @@ class LeastSquares:
         columns = np.concatenate(parts, axis=1)
         q = detections.q - q_reference
         size = shared + 3 * detections.marker.size
-        return cls(detections, q, q_reference, joint, shared, size, columns, None, curve_terms)
+        by_twist = detections.by_twist()
+        return cls(detections, q, q_reference, joint, shared, size, columns, None, curve_terms, by_twist)
 
     def alike(self, detections: Detections) -> "LeastSquares":
         """Problem of the same parameters but for markers, of other detections, without noise of joints."""
@@ -118,7 +123,11 @@ class LeastSquares:
 
     def joints(self, params: Parameters) -> FloatArray:
         """Readings (K, n) from the reference, rad or m, with the offsets if joint readings have noise."""
-        return self.q if self.tau is None or params.offsets is None else self.q + params.offsets
+        if self.tau is None or params.offsets is None:
+            return self.q
+        if self.by_twist is None:
+            return self.q + params.offsets
+        return np.asarray(self.q + (self.by_twist @ params.offsets[..., None])[..., 0])
 
     def strain(self, params: Parameters) -> FloatArray:
         """Offsets (K, n) over their noise, times that of pixels, px; (0, n) without noise of joints."""
@@ -174,7 +183,7 @@ class LeastSquares:
         blocks = [by_camera]
         for i, B in enumerate(_generators(params)):
             turn = B.transpose(2, 1, 0).reshape(4, -1)
-            near, far = (D[k] @ (Y[k] @ turn).reshape(-1, 4, len(B)) for k in (i, i + 1))
+            near, far = (D[k] @ (Y[k] @ turn).reshape(len(Y[k]), 4, len(B)) for k in (i, i + 1))
             blocks.append(near - far)
         if by_lens is not None:
             blocks.append(by_lens[..., : self.lens_terms])
@@ -184,28 +193,17 @@ class LeastSquares:
         return np.concatenate(blocks, axis=3) * detections.weight[..., None, None]
 
     def joint_derivative(self, params: Parameters) -> FloatArray:
-        """Derivative (V, N, 2, n) of the weighted images by the joint values."""
+        """Derivative (V, N, 2, n) of the weighted images by the joint values, or by twists of the flange."""
         images = params.images(self.joints(params), self.detections.pose_of, self.detections.marker_of)
-        return images.by_joint(params.H_hat) * self.detections.weight[..., None, None]
+        by_joint = images.by_joint(params.H_hat) * self.detections.weight[..., None, None]
+        if self.by_twist is None:
+            return by_joint
+        return np.asarray(by_joint @ self.by_twist[self.detections.pose_of])
 
     def retract(self, params: Parameters, x: FloatArray) -> Parameters:
         """Parameters after a step x (size or more,); screws move rigidly and keep their constraints."""
         x, further = x[: self.size], x[self.size :]
-        steps = np.split(x[self.joint[0] : self.joint[-1]], self.joint[1:-1] - self.joint[0])
-        twists = [np.tensordot(step, B, axes=1) for step, B in zip(steps, _generators(params), strict=True)]
-        motion = expm(np.array(twists))
-        moved = motion @ params.H_hat @ np.linalg.inv(motion)
-        # Restore speed and zero pitch, which the step leaves to round-off.
-        H_hat = np.zeros_like(moved)
-        for i, slides in enumerate(params.prismatic):
-            v = moved[i, :3, 3]
-            if slides:
-                H_hat[i, :3, 3] = v * np.linalg.norm(params.H_hat[i, :3, 3]) / np.linalg.norm(v)
-            else:
-                w = _axis_of(0.5 * (moved[i] - moved[i].T))
-                w /= np.linalg.norm(w)
-                H_hat[i, :3, :3] = cross_matrix(w)
-                H_hat[i, :3, 3] = v - w * (w @ v)
+        H_hat = params.H_hat if params.known_arm else self._moved_screws(params, x)
         M = params.M.copy()
         M[:, :3] += x[self.shared :].reshape(-1, 3)
         lens = params.lens
@@ -221,29 +219,59 @@ class LeastSquares:
         if self.tau is not None and further.size:
             offsets = (0.0 if offsets is None else offsets) + self.tau * further.reshape(self.q.shape)
         P = params.P + x[: params.P.size].reshape(-1, 3, 4)
-        return Parameters(P, H_hat, params.prismatic, M, lens, offsets, self.lens_terms, curve)
+        moved = dataclasses.replace(params, P=P, H_hat=H_hat, M=M, lens=lens, offsets=offsets, curve=curve)
+        return dataclasses.replace(moved, lens_terms=self.lens_terms)
+
+    def _moved_screws(self, params: Parameters, x: FloatArray) -> FloatArray:
+        """Operators (n, 4, 4) after a step, moved rigidly."""
+        steps = np.split(x[self.joint[0] : self.joint[-1]], self.joint[1:-1] - self.joint[0])
+        twists = [np.tensordot(step, B, axes=1) for step, B in zip(steps, _generators(params), strict=True)]
+        motion = expm(np.array(twists))
+        moved = motion @ params.H_hat @ np.linalg.inv(motion)
+        # Restore speed and zero pitch, which the step leaves to round-off.
+        H_hat = np.zeros_like(moved)
+        for i, slides in enumerate(params.prismatic):
+            v = moved[i, :3, 3]
+            if slides:
+                H_hat[i, :3, 3] = v * np.linalg.norm(params.H_hat[i, :3, 3]) / np.linalg.norm(v)
+            else:
+                w = _axis_of(0.5 * (moved[i] - moved[i].T))
+                w /= np.linalg.norm(w)
+                H_hat[i, :3, :3] = cross_matrix(w)
+                H_hat[i, :3, 3] = v - w * (w @ v)
+        return H_hat
 
     def gauge(self, params: Parameters) -> FloatArray:
         """Unit directions (size, g) of the parameters that change no image.
 
         Six rigid motions of the frame, its scale unless a prismatic joint sets it, and the cameras' scales.
+        Known operators set the frame.
         """
+        frame, V = self._of_frame(params), len(params.P)
+        g = frame.shape[1]
+        result = np.hstack([frame, np.zeros((self.size, V))])
+        for v in range(V):
+            result[v * CAMERA : (v + 1) * CAMERA, g + v] = params.P[v].ravel()
+        return np.asarray(result / np.linalg.norm(result, axis=0))
+
+    def _of_frame(self, params: Parameters) -> FloatArray:
+        """Directions (size, g) of a rigid motion and scaling of the frame, none where operators set it."""
+        if params.known_arm:
+            return np.zeros((self.size, 0))
         motions = np.zeros((6 if params.prismatic.any() else 7, 4, 4))
         motions[:3, :3, :3] = cross_matrix(np.eye(3))
         motions[3:6, :3, 3] = np.eye(3)
         motions[6:, :3, :3] = np.eye(3)
-        V, g = len(params.P), len(motions)
-        result = np.zeros((self.size, g + V))
-        result[: V * CAMERA, :g] = -(params.P @ motions[:, None]).reshape(g, -1).T
+        g = len(motions)
+        result = np.zeros((self.size, g))
+        result[: params.P.size] = -(params.P @ motions[:, None]).reshape(g, -1).T
         for i, (H_hat, reach) in enumerate(zip(params.H_hat, moved_operators(params), strict=True)):
             wanted = (motions @ H_hat - H_hat @ motions).reshape(-1, 16).T
             coefficients = np.linalg.lstsq(reach.reshape(-1, 16).T, wanted, rcond=None)[0]
-            result[self.joint[i] : self.joint[i + 1], :g] = coefficients
+            result[self.joint[i] : self.joint[i + 1]] = coefficients
         moved = (params.M @ motions.swapaxes(1, 2))[..., :3]
-        result[self.shared :, :g] = moved.reshape(g, -1).T
-        for v in range(V):
-            result[v * CAMERA : (v + 1) * CAMERA, g + v] = params.P[v].ravel()
-        return np.asarray(result / np.linalg.norm(result, axis=0))
+        result[self.shared :] = moved.reshape(g, -1).T
+        return result
 
     def at_poses(self, values: FloatArray) -> FloatArray:
         """Sums (K, …) of values (N, …) over the observations of each pose."""

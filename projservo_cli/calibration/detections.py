@@ -17,6 +17,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from projservo_cli.findings import LIMITS, REACH_M, REACH_RAD, Finding, Subject
+from projservo_cli.geometry.flange import FlangeChart
 from projservo_cli.messages.placeholders import quantity
 from projservo_cli.messages.rows_by_code import Setup
 from projservo_cli.records import (
@@ -89,6 +90,7 @@ class Detections:
     view: tuple[str, ...] = VIEWS  # names of the views
     mount: str = WORLD  # of cameras on the tool, the chain is that of the scene: joints in reverse, negated
     pair: tuple[int, ...] = (0, 1)  # the one or two views by which a fit begins and noise is known
+    chart: FlangeChart | None = None  # of poses of the flange; None for joints
 
     @classmethod
     def of(cls, observation: Observation, joint_types: str, mount: str = WORLD) -> "Detections":
@@ -134,6 +136,7 @@ class Detections:
             view=observation.view,
             mount=mount,
             pair=(0, 1)[: len(observation.view)],
+            chart=FlangeChart.from_optional(observation.flange_chart),
         )
 
     def everywhere(self, q: FloatArray, which: IntArray | None = None) -> "Detections":
@@ -142,10 +145,33 @@ class Detections:
         marker_of, pose_of = np.repeat(which, len(q)), np.tile(np.arange(len(q)), which.size)
         V = len(self.seen)
         pixels, weight = np.zeros((V, marker_of.size, 2)), np.ones((V, marker_of.size))
-        where = np.arange(len(q)), self.marker, pose_of, marker_of
-        return Detections(
-            q, self.prismatic, *where, pixels, weight > 0.0, weight, None, self.view, self.mount, self.pair
+        return dataclasses.replace(
+            self,
+            q=q,
+            pose=np.arange(len(q)),
+            pose_of=pose_of,
+            marker_of=marker_of,
+            pixels=pixels,
+            seen=weight > 0.0,
+            weight=weight,
+            stated_px=None,
         )
+
+    @property
+    def known_operators(self) -> FloatArray | None:
+        """Operators (6, 4, 4) in the base, m, of poses of the flange along the chain; None for joints."""
+        if self.chart is None:
+            return None
+        H_hat = self.chart.H_hat
+        return H_hat[::-1] if self.mount == TOOL else H_hat
+
+    def by_twist(self) -> FloatArray | None:
+        """Derivatives (K, 6, 6) of ``q`` by a twist of the flange; None for joints."""
+        if self.chart is None:
+            return None
+        q = -self.q[:, ::-1] if self.mount == TOOL else self.q
+        by_twist = self.chart.by_twist(q)
+        return -by_twist[:, ::-1, ::-1] if self.mount == TOOL else by_twist
 
     @property
     def numbers(self) -> IntArray:
@@ -161,7 +187,7 @@ class Detections:
     @property
     def setup(self) -> Setup:
         """Arm and cameras, for words."""
-        return Setup(self.mount, self.view, self.prismatic.size)
+        return Setup(self.mount, self.view, self.prismatic.size, self.chart is not None)
 
     @property
     def both(self) -> BoolArray:
@@ -243,6 +269,8 @@ class Detections:
 
     def home(self) -> int | None:
         """Row of q that all others differ from in at most one joint, the reference of single-joint trials."""
+        if self.chart is not None:
+            return None
         q = self.q
         candidates = np.arange(len(q))
         for row in q:
@@ -261,6 +289,8 @@ class Detections:
 
     def reference(self) -> FloatArray:
         """Reference joints (n,) of the model: the reference of trials, else the most central pose."""
+        if self.chart is not None:
+            return np.zeros(self.q.shape[1])
         row = self.home()
         if row is None:
             span = np.ptp(self.q, axis=0)

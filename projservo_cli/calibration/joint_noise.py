@@ -31,6 +31,9 @@ _MIN_SIGMA_Q = 1e-6
 _MAX_SIGMA_Q = np.radians(1.0)
 # Number of noise ratios in the scan.
 _GRID = 33
+# Noise of translations over that of rotations that is tried, in units of 0.3 m/rad; steps of a refinement,
+# and number of noise ratios in the scan of each.
+_LEVERS, _LEVER_STEPS, _ROUGH_GRID = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0), 8, 13
 # Logarithm by which the lower end of the interval may lie below the scan.
 _FARTHER = 5.0
 # Deviance where the likelihood is not defined.
@@ -65,6 +68,16 @@ class JointNoise:
     interval: FloatArray | None  # (2,) of 95 %; None if it was given or explains nothing
     over_pixels: float  # sigma_q over the noise of pixels, rad/px
     ticks: bool = False  # whether it is that of encoder ticks
+    lever: float = 1.0  # factor on the noise of prismatic joints, estimated for translations of a flange
+
+    def tau(self, prismatic: BoolArray) -> FloatArray:
+        """Noise of joint readings (n,) over that of pixels, rad/px or m/px."""
+        return self.over_pixels * _units(prismatic, self.lever)
+
+    @property
+    def sigma_m(self) -> float:
+        """Deviation of prismatic joints, or of positions of a flange, m."""
+        return float(self.sigma_q * _units(np.array([True]), self.lever)[0])
 
     @classmethod
     def estimated(
@@ -89,6 +102,8 @@ class JointNoise:
             used, params = used[:, keep[detections.marker_of]], replace(params, M=params.M[keep])
             problem = problem.of_markers(keep)
         likelihood = _Likelihood(problem, params, used, sigma_px)
+        if problem.detections.chart is not None:
+            likelihood = likelihood.with_lever()
         # Logarithms of the ratio of both noises, rad/px; at the maximum pixels may have far less noise.
         sigma = max(likelihood.sigma(_NONE), MIN_SIGMA)
         ends = (
@@ -121,10 +136,12 @@ class JointNoise:
             return cls(0.0, np.array([0.0, high]), 0.0)
         if likelihood.contradicted(log_ratio):
             return NO_JOINT_NOISE
-        counted = _tick_noise(problem.detections.q, problem.detections.prismatic)
+        of_joints = problem.detections.chart is None
+        counted = _tick_noise(problem.detections.q, problem.detections.prismatic) if of_joints else 0.0
         ticks, sigma_q = low <= counted <= high, likelihood.sigma_q(log_ratio)
         taken = counted if ticks else sigma_q
-        return cls(taken, np.array([low, high]), float(np.exp(log_ratio)) * taken / sigma_q, ticks)
+        over_pixels = float(np.exp(log_ratio)) * taken / sigma_q
+        return cls(taken, np.array([low, high]), over_pixels, ticks, likelihood.lever)
 
 
 NO_JOINT_NOISE = JointNoise(0.0, None, 0.0)  # if no noise of joints explains the residuals
@@ -134,10 +151,16 @@ class _Likelihood:
     """Restricted likelihood of the residuals, by the logarithm of the noise of joints over pixels, rad/px."""
 
     def __init__(
-        self, problem: LeastSquares, params: Parameters, used: BoolArray, sigma_px: float | None
+        self,
+        problem: LeastSquares,
+        params: Parameters,
+        used: BoolArray,
+        sigma_px: float | None,
+        lever: float = 1.0,
     ) -> None:
-        self.given = sigma_px
-        unit, J = per_rad(problem.detections.prismatic), problem.derivative(params)
+        self.given, self.lever = sigma_px, lever
+        self._data = problem, params, used, sigma_px
+        unit, J = _units(problem.detections.prismatic, lever), problem.derivative(params)
         D = problem.dense(J, used)
         A = D.T @ D
         errors, residual = JointErrors(problem, params, used, unit), problem.residual(params)
@@ -157,6 +180,25 @@ class _Likelihood:
         self.h = errors.parts(residual.ravel())
         self.g = free.T @ (D.T @ residual.ravel())
         self.square = float((residual**2).sum())
+
+    def with_lever(self) -> "_Likelihood":
+        """Likelihood with the maximum-likelihood noise of translations over that of rotations."""
+
+        def lowest(log_lever: float) -> float:
+            """Lowest deviance with a lever."""
+            of = _Likelihood(*self._data, lever=float(np.exp(log_lever)))
+            sigma = max(of.sigma(_NONE), MIN_SIGMA)
+            scan = np.log(np.geomspace(_MIN_SIGMA_Q / sigma, _MAX_SIGMA_Q / (_SHARE * sigma), _ROUGH_GRID))
+            values = [of.deviance(log_ratio) for log_ratio in scan]
+            i = int(np.argmin(values))
+            ends = scan[max(i - 1, 0)], scan[min(i + 1, _ROUGH_GRID - 1)]
+            return float(minimize_scalar(of.deviance, bounds=ends, method="bounded").fun)
+
+        scan = np.log(_LEVERS)
+        i = int(np.argmin([lowest(log_lever) for log_lever in scan]))
+        ends = scan[max(i - 1, 0)], scan[min(i + 1, len(scan) - 1)]
+        found = minimize_scalar(lowest, bounds=ends, method="bounded", options={"maxiter": _LEVER_STEPS})
+        return _Likelihood(*self._data, lever=float(np.exp(found.x)))
 
     def _normal(self, log_ratio: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Normal equations A, g in the free directions, and squared image changes (K n,) by the joints."""
@@ -207,6 +249,11 @@ class _Likelihood:
     def sigma_q(self, log_ratio: float) -> float:
         """Noise of joints, rad."""
         return float(np.exp(log_ratio) * self.sigma(log_ratio))
+
+
+def _units(prismatic: BoolArray, lever: float) -> FloatArray:
+    """Noise of joints (n,) for each rad of that of revolute ones."""
+    return np.where(prismatic, lever, 1.0) * per_rad(prismatic)
 
 
 def _tick_noise(q: FloatArray, prismatic: BoolArray) -> float:

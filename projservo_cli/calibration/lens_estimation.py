@@ -111,6 +111,8 @@ def fit_lens(solution: Solution, search: Search) -> tuple[Solution, ImageGeometr
 def _fit_terms(solution: Solution, params: Parameters, terms: int, search: Search) -> Solution | None:
     """Fit some terms of the lenses; None if it fails, or a lens folds within the images."""
     problem = LeastSquares.of(solution.problem.detections, solution.problem.q_reference, terms)
+    if params.known_arm:  # poses of a flange err, and an exact fit would reject some of them whole
+        problem = problem.with_noise(solution.problem.tau)
     found = fit_from(problem, dataclasses.replace(params, lens_terms=terms), search.epipolar)
     if found is None or found.params.lens is None:
         return None

@@ -60,6 +60,7 @@ from projservo_cli.calibration.robust_fit import (
     Expected,
     Misfit,
     Solution,
+    by_usual_noise,
     fewer,
     fit_joint_noise,
     solve,
@@ -272,6 +273,8 @@ def _maximum_likelihood(
             search = dataclasses.replace(start, problem=solution.problem, frame=frame)
         if lens:
             search.progress("calibration, lens", 0, 1)
+            if solution.params.known_arm and search.joint_noise is None:
+                solution = by_usual_noise(solution, expected)
             solution, epipolar = fit_lens(solution, search)
         if len(whole.view) > 2:  # once more with the lenses
             solution, epipolar = with_own_noise(solution, epipolar)
@@ -429,6 +432,7 @@ def _record(
             H_hat_0=params.H_hat,
             q_reference=problem.q_reference,
             a_inf=result.a_inf,
+            flange_chart=None if detections.chart is None else detections.chart.record,
             **_curve_fields(params.curve, off),
         ),
         body=CalibratedBody(marker=detections.marker, M=params.M),
@@ -470,6 +474,7 @@ def _quality(solution: Solution, expected: Expected) -> FitQuality:
         markers_used=int(np.unique(detections.marker_of[used_rows]).size),
         sigma_q=None if joint_noise is None else joint_noise.sigma_q,
         sigma_q_interval=None if joint_noise is None else joint_noise.interval,
+        sigma_flange_m=None if joint_noise is None or detections.chart is None else joint_noise.sigma_m,
         encoder_counts=joint_noise is not None and joint_noise.ticks,
         model_px=float(np.sqrt(over)),
     )

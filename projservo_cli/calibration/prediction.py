@@ -10,7 +10,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from projservo_cli.calibration.detections import per_rad
 from projservo_cli.geometry.displacements import displacements, sine_and_versine
+from projservo_cli.geometry.flange import FlangeChart
 from projservo_cli.geometry.joint_curve import backwards, basis, slopes, true_joints
 from projservo_cli.geometry.lens import distort, distort_derivative, distort_visible
 from projservo_cli.records import (
@@ -133,6 +135,7 @@ class Parameters:
     offsets: FloatArray | None = None
     lens_terms: int = 0  # number of estimated ``TERMS`` of each lens: 0, k1 and k2, or those and the centre
     curve: JointCurve | None = None  # of true joints by readings, None where they are equal
+    known_arm: bool = False  # whether the operators are known, as of poses of the flange, and not fitted
 
     def turned(self, q: FloatArray) -> FloatArray:
         """True joints (K, n) at readings (K, n), both from the reference."""
@@ -232,7 +235,9 @@ def parameters_from(calibration: Calibration) -> Parameters:
     prismatic, terms, curve = c.prismatic[::way], c.lens_terms, c.curve
     if curve is not None and c.mount == TOOL:
         curve = backwards(curve, len(prismatic))
-    return Parameters(c.P, c.H_hat_0[::way], prismatic, c.M, c.lens, lens_terms=terms, curve=curve)
+    known = c.flange_chart is not None
+    H_hat = c.H_hat_0[::way]
+    return Parameters(c.P, H_hat, prismatic, c.M, c.lens, lens_terms=terms, curve=curve, known_arm=known)
 
 
 def errors_of(calibration: Calibration) -> Errors:
@@ -366,6 +371,17 @@ def error_factor_with_model(calibration: Calibration) -> FloatArray:
     """
     factor, bias = error_factor(calibration), calibration.model_error_bias
     return factor if bias is None else np.hstack([factor, bias])
+
+
+def reading_changes(calibration: Calibration, q: FloatArray) -> FloatArray:
+    """Changes (K, V, m, 2, n) of predicted pixels by a deviation of each reading."""
+    J, sigma_q = joint_derivative(calibration, q), calibration.sigma_q or 0.0
+    chart = FlangeChart.from_optional(calibration.flange_chart)
+    if chart is None:
+        return J * (sigma_q * per_rad(calibration.prismatic))
+    of_places = calibration.sigma_flange_m or 0.0
+    twist = chart.by_twist(q)[:, None, None] * np.where(calibration.prismatic, of_places, sigma_q)
+    return np.asarray(J @ twist)
 
 
 def joint_derivative(calibration: Calibration, q: FloatArray) -> FloatArray:

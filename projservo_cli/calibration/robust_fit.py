@@ -16,7 +16,6 @@ from projservo_cli.calibration.detections import (
     Detections,
     even_choice,
     medians,
-    per_rad,
 )
 from projservo_cli.calibration.initial.epipolar import OUTLIER, ImageGeometry
 from projservo_cli.calibration.initial.initialization import Nominal, Search, starting_markers, starts
@@ -73,6 +72,8 @@ _HOPELESS = 10.0
 _CRAWL = 0.01
 # Number of steps over which this gain is measured.
 _PATIENCE = 10
+# Usual error of poses of a flange, rad and × 0.3 m/rad, of arms as manufacturers calibrate them.
+_USUAL_OF_POSES = 1e-3
 # Maximum number of rounds between the fit and the noise of joints.
 _NOISE_ROUNDS = 5
 # Relative change of the noise of joints that ends them.
@@ -448,7 +449,8 @@ def _robust_search(
 
     Returns the parameters and the median residual, px.
     """
-    params = minimize(problem, params, rows, robust=True, cameras=False, max_steps=20).params
+    if not params.known_arm:
+        params = minimize(problem, params, rows, robust=True, cameras=False, max_steps=20).params
     stalled = _stall_check(rows, REFUSE_RATIO * epipolar.noise_px)
     fit = minimize(problem, params, rows, robust=True, max_steps=100, stalled=stalled)
     return fit.params, median_px(fit.residual, rows)
@@ -579,6 +581,8 @@ def fit_joint_noise(exact: Solution, expected: Expected, given: float | None) ->
     """
     if given == 0.0 or exact.joint_noise is not None:
         return exact
+    if given is None and exact.problem.detections.chart is not None:
+        return _fit_pose_noise(exact, expected)
     sigma_px, solution = None if expected.min_px else expected.sigma_px, exact
     for _ in range(_NOISE_ROUNDS):
         before = solution.joint_noise
@@ -592,17 +596,48 @@ def fit_joint_noise(exact: Solution, expected: Expected, given: float | None) ->
             return dataclasses.replace(exact, joint_noise=noise)
         if before is not None and abs(noise.sigma_q - before.sigma_q) <= _NOISE_SETTLED * before.sigma_q:
             break
-        problem = exact.problem.with_noise(noise.over_pixels * per_rad(exact.problem.detections.prismatic))
-        # Start robustly: the exact fit has absorbed some errors of the joints.
-        params = minimize(problem, solution.params, solution.used, robust=True, max_steps=20).params
-        min_px = sigma_px or expected.min_px
-        found = fit_inliers(problem, params, noise.sigma_q / noise.over_pixels, min_px=min_px)
+        found = _with_noise(solution, noise, sigma_px or expected.min_px)
         if found is None:
             return dataclasses.replace(exact, joint_noise=NO_JOINT_NOISE)
         solution = dataclasses.replace(found, joint_noise=noise)
     alone = given is None and expected.refusal(exact) is None  # else noise of joints is all that explains it
     if alone and left_out_px(solution) > _NO_WORSE * left_out_px(exact):
         return dataclasses.replace(exact, joint_noise=NO_JOINT_NOISE)
+    return solution
+
+
+def _with_noise(solution: Solution, noise: JointNoise, min_px: float) -> Solution | None:
+    """Fit with a noise of joint readings, robustly at first: a fit without it has absorbed some errors."""
+    problem = solution.problem.with_noise(noise.tau(solution.problem.detections.prismatic))
+    params = minimize(problem, solution.params, solution.used, robust=True, max_steps=20).params
+    return fit_inliers(problem, params, noise.sigma_q / noise.over_pixels, min_px=min_px)
+
+
+def by_usual_noise(exact: Solution, expected: Expected) -> Solution:
+    """Fit poses of a flange with their usual errors, if it keeps as many images as an exact fit."""
+    noise = JointNoise(_USUAL_OF_POSES, None, _USUAL_OF_POSES / expected.sigma_px)
+    every = dataclasses.replace(exact, used=exact.problem.detections.seen)
+    found = _with_noise(every, noise, expected.min_px)
+    return exact if found is None or found.used.sum() < exact.used.sum() else found
+
+
+def _fit_pose_noise(start: Solution, expected: Expected) -> Solution:
+    """Refit with the noise of poses of a flange, which no arm reaches exactly; without if none shows."""
+    sigma_px = None if expected.min_px else expected.sigma_px
+    solution = start if start.problem.tau is not None else by_usual_noise(start, expected)
+    for _ in range(_NOISE_ROUNDS):
+        before, there = solution.joint_noise, (solution.problem, solution.params, solution.used)
+        noise = JointNoise.estimated(*there, sigma_px, expected.min_px)
+        if noise.sigma_q == 0.0:
+            exact = dataclasses.replace(solution.params, offsets=None)
+            found = fit_inliers(solution.problem.with_noise(None), exact, solution.sigma_px)
+            return dataclasses.replace(found or start, joint_noise=noise)
+        if before is not None and abs(noise.sigma_q - before.sigma_q) <= _NOISE_SETTLED * before.sigma_q:
+            break
+        found = _with_noise(solution, noise, sigma_px or expected.min_px)
+        if found is None:
+            break
+        solution = dataclasses.replace(found, joint_noise=noise)
     return solution
 
 

@@ -193,7 +193,8 @@ def _in_detail(value: dict[str, Any]) -> Iterator[str]:
         errors = _number(term["left_out_without_px"]), _number(term["left_out_px"])
         yield "  left-out poses: {} px without, {} px with it".format(*errors)
     if value["sigma_q"] is not None:
-        yield wrapped(f"joint readings: {_joint_noise(value)}", "  ")
+        of_what = "poses of the flange" if value["readings"] == "flange" else "joint readings"
+        yield wrapped(f"{of_what}: {_joint_noise(value)}", "  ")
     if value["time_offset_s"] is not None:
         yield wrapped(f"time offset {', '.join(_time_offsets(value))}", "  ")
     poorly = ", ".join(joint["name"] for joint in value["joints"] if joint["poorly_observable"])
@@ -274,7 +275,9 @@ def _joint_noise(value: dict[str, Any]) -> str:
     low, high = (math.degrees(end) for end in interval)
     if sigma == 0.0:
         return f"no noise shows (95 %: below {high:.2g}°)"
-    return f"off by {sigma:.3g}° rms (95 %: {low:.3g}° to {high:.3g}°)"
+    places = value["sigma_flange_m"]
+    and_places = "" if places is None else f" and {1e3 * places:.3g} mm"
+    return f"off by {sigma:.3g}°{and_places} rms (95 %: {low:.3g}° to {high:.3g}°)"
 
 
 def _time_offsets(value: dict[str, Any]) -> Iterator[str]:
@@ -295,7 +298,11 @@ def _of_suggestions(value: dict[str, Any]) -> Iterator[str]:
     if not rows:
         return
     revolute = [joint["type"] == "R" for joint in value["joints"]]
-    names = "".join(f"{f'q{i} ' + ('deg' if turns else 'mm'):>9}" for i, turns in enumerate(revolute, 1))
+    titles = [f"q{i}" for i in range(1, len(revolute) + 1)]
+    if value["readings"] == "flange":
+        revolute, titles = [False] * 3 + [True] * 3, ["x", "y", "z", "turn", "turn", "turn"]
+    units = ["deg" if turns else "mm" for turns in revolute]
+    names = "".join(f"{f'{title} {unit}':>9}" for title, unit in zip(titles, units, strict=True))
     now = math.sqrt(rows[0]["variance_before"])
     yield f"  poses to add, as offsets from a recorded one; predicted error {now:.3g} px now"
     yield f"  {'from pose':>9}{names}{'then px':>9}"
@@ -303,6 +310,9 @@ def _of_suggestions(value: dict[str, Any]) -> Iterator[str]:
         way = (math.degrees(d) if turns else 1e3 * d for d, turns in zip(row["delta"], revolute, strict=True))
         then = math.sqrt(row["variance_after"])
         yield f"  {row['from_pose']:>9}" + "".join(f"{d:>+9.1f}" for d in way) + f"{then:>9.3g}"
+    if value["readings"] == "flange":
+        yield f"  these poses of the flange: {value['suggestions_file']} (m)"
+        return
     yield f"  joints of these poses: {value['suggestions_file']} ({value['suggestions_unit']}, m)"
     if not value["suggestions_limited"]:
         yield wrapped(_NO_LIMITS, "  ")

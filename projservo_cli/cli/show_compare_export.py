@@ -225,7 +225,7 @@ def _in_metres(
         raise failed(wrong, stage="export")
     if model is not None and model[2]:
         metric = metric.in_frames_of(*model[:2])
-    if metric.mount == TOOL:
+    if metric.mount == TOOL or metric.by_flange:
         value["mount"] = metric.mount
         words += [f"{view} camera {metric.summary()[f'{view} camera']}" for view in metric.view]
     found = opencv_cameras(metric, calibration)
@@ -242,7 +242,7 @@ def _in_metres(
         names += [f"joint_{i}" for i in range(len(names) + 1, len(metric.joint_types) + 1)]
         known = joints_of(config).joints(metric.joint_types, calibration).limits
         limits = np.stack([known.lower, known.upper], axis=1)
-        if not np.isfinite(limits).all():
+        if not np.isfinite(limits).all() and not metric.by_flange:
             words.append("where limits of joints are unknown, they are the readings of the trial motions")
         limits = np.where(np.isfinite(limits), limits, metric.range)
         return exports.urdf(metric, names, limits), value, words

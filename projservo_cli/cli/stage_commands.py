@@ -39,7 +39,8 @@ _OF_STAGES = (
         "--readings",
         metavar="TABLE",
         type=click.Path(),
-        help="Joints of each pose (CSV), where --data lists detections: pose, camera, marker, u, v.",
+        help="Joints, or poses of the flange (CSV), where --data lists detections: pose, camera, "
+        "marker, u, v.",
     ),
     click.option(
         "--mount",
@@ -508,7 +509,9 @@ def _work(console: Console, chain: "Chain", options: Mapping[str, Any]) -> int:
     if (count := options.get("suggest")) is not None and not chain.lacks("calibrate"):
         beside["calibrate"] = chain.suggestions(count)
     if "calibrate" in chain.names:
-        beside["calibrate"]["joint_types_assumed"] = chain.config.joint_types is None
+        done = not chain.lacks("calibrate")
+        by_joints = done and chain.run.calibration.flange_chart is None
+        beside["calibrate"]["joint_types_assumed"] = by_joints and chain.config.joint_types is None
     if (wanted := _optional_files(options)) and not chain.lacks("report"):
         beside["report"] |= chain.optional_files(wanted)
     beside["report"]["replayed"] = chain.replayed()

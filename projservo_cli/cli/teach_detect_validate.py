@@ -302,7 +302,7 @@ def _sources(images: tuple[str, ...]) -> dict[str, str]:
     "--readings",
     metavar="TABLE",
     type=option.PATH,
-    help="Joints of each pose (CSV), where --data lists detections: pose, camera, marker, u, v.",
+    help="Joints, or poses of the flange (CSV), where --data lists detections: pose, camera, marker, u, v.",
 )
 @click.option(
     "--metric",
@@ -388,7 +388,11 @@ def _validate(
         console.report({"run": found.path.resolve(), **value}, [text.format_map(value) for text in lines])
         return
     unit = calibration.joint_types, joint_unit
-    observation = read_table(data, *unit) if readings is None else read_detections(data, readings, *unit)
+    observation = (
+        read_table(data, *unit, like=calibration)
+        if readings is None
+        else read_detections(data, readings, *unit, like=calibration)
+    )
     compared_with = compared(calibration, observation, config.image_size_px)
     value, setup = {"run": found.path.resolve(), **compared_with}, setup_of(calibration)
     for text in value.get("advice", ()):

@@ -145,7 +145,8 @@ def order_advice(calibration: Calibration) -> str:
 
 def setup_of(calibration: Calibration) -> Setup:
     """Return the arm and the cameras of a calibration."""
-    return Setup(calibration.mount, calibration.view, len(calibration.joint_types))
+    by_flange = calibration.flange_chart is not None
+    return Setup(calibration.mount, calibration.view, len(calibration.joint_types), by_flange)
 
 
 def _cause(findings: Sequence[Finding]) -> Finding:

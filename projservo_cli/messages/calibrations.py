@@ -246,6 +246,21 @@ CALIBRATION = {
         "give all joints in one unit, --joint-unit (data.joint_unit)",
         limit="the unit of joints",
     ),
+    "inverse_poses": Row(
+        "these look like poses of the base in the flange",
+        "invert them: p_base = T p_flange",
+        limit="inverse poses",
+    ),
+    "transposed_rotations": Row(
+        "the rotations of the poses look transposed",
+        "give the 3×4 matrices row by row, T11, T12, T13, T14, T21, …",
+        limit="transposed rotations",
+    ),
+    "scalar_first": Row(
+        "the quaternions look like qw, qx, qy, qz",
+        "name the columns in their order; projservo reads qx, qy, qz, qw by name",
+        limit="the order of quaternions",
+    ),
     "image_size_changed": Row(
         "from pose {poses} on images are {times_as} as large as before",
         "record again at one resolution, or remove the poses before or after",
@@ -353,5 +368,52 @@ REFUSALS = {
 ON_THE_TOOL = {
     "base": Row(
         "the cameras moved on the tool{begin}, by {size}", _AGAIN, limit="motion of the cameras on the tool"
+    ),
+}
+_POSES = "check the poses of the flange and their images, and the marker numbers"
+# By poses of the flange instead of joint readings.
+BY_FLANGE = {
+    "scale": Row("{joints} {moves} {size} {more} than {reads}", "check the units", limit="scale of {joints}"),
+    "joint_noise": Row("poses of the flange off by {amount} and {reach} rms", limit="noise"),
+    "coarse_joints": Row(
+        "errors of poses of the flange move images by {effect}, more than pixel noise",
+        "a finer or better calibrated arm would help",
+        limit="poses of the flange, which move images by {effect}",
+    ),
+    "lagging_joints": Row(
+        "look for poses of the flange that lag behind the images", limit="poses of the flange"
+    ),
+    "suspect_readings": Row(
+        "poses of the flange that disagree with the images: {count}", "check how poses and images are paired"
+    ),
+    "misfit": Row(
+        _MISFIT + "residuals of {amount} a coordinate are {ratio} times the {limit} {origin}",
+        _POSES,
+        limit="the model",
+    ),
+    "no_start": Row(
+        "the data contradict the poses of the flange from the start",
+        "check that they belong to their images, their units (m, rad) and their sense, flange in base",
+        limit="the poses of the flange",
+    ),
+    "rejects_most": Row(_NO_FIT + "that is most of them", _POSES, limit="the poses of the flange"),
+    "rejected_motion": Row(
+        "the fit rejects most motion along or about {joints}", _POSES, limit="poses of the flange"
+    ),
+    "other_joints": Row(
+        _MISFIT
+        + "{count} of {total} observations, at {rest} of {of_rest} poses, show other poses than given",
+        "check how poses and images are paired",
+        limit="poses of the flange",
+    ),
+    "images_before_readings": Row(
+        "each image shows the pose before its own",
+        "let each pose settle for longer, and take the newest frame",
+        limit="poses of other images",
+    ),
+    "images_after_readings": Row(
+        "each image shows the pose after its own",
+        "store poses with the image of the same moment, and take the newest frame",
+        limit="poses of other images",
     ),
 }

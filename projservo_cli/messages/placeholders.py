@@ -34,6 +34,8 @@ _ORIGINS = {
     "stated, by body": "that the sigmas of the markers state, times {amount:.3g} as a rigid body shows",
 }
 
+# Coordinates of a pose of the flange, as joints in their order.
+COORDINATES = "x", "y", "z", "the first turn", "the second turn", "the third turn"
 # Markers that a look at an object needs, and why, by their number; what fewer leave open, by theirs.
 _NEEDED = {
     3.0: "3 off one line",
@@ -106,6 +108,10 @@ def joined(words: Iterable[object]) -> str:
 
 def _joints(told: Wording) -> str:
     everything = (told.one.code == "scale" and not told.single) or not told.joints
+    if told.setup.flange:
+        return (
+            "the flange" if everything else f"{joined(COORDINATES[i - 1] for i in told.joints)} of the flange"
+        )
     return "all joints" if everything else numbered("joint", told.joints)
 
 
@@ -339,6 +345,7 @@ VALUES: dict[str, Callable[[Wording], object]] = {
     "number": lambda told: f"{told.one.limit:.3g}",
     "ratio": lambda told: f"{told.one.amount / told.one.limit:.3g}" if told.one.limit else "",
     "percent": lambda told: f"{100.0 * told.one.amount:.0f}",
+    "reach": lambda told: quantity(told.one.limit, "m"),
     "effect": lambda told: quantity(told.one.effect_px, "px"),
     "fits": lambda told: "prismatic" if told.one.unit == "m" else "revolute",
     "given": lambda told: "revolute" if told.one.unit == "m" else "prismatic",

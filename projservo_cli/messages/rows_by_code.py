@@ -29,9 +29,12 @@ class Setup(NamedTuple):
     mount: str = WORLD
     view: Sequence[str] = VIEWS
     joints: int = 6  # number of the joints
+    flange: bool = False  # whether readings are poses of the flange, whose coordinates joints are
 
 
 def row_of(one: Finding, setup: Setup) -> Row:
     """Return the row of a finding."""
+    if setup.flange and one.code in calibrations.BY_FLANGE:
+        return calibrations.BY_FLANGE[one.code]
     special = _ON_THE_TOOL if setup.mount == TOOL else monitoring.BY_ONE if len(setup.view) == 1 else {}
     return special.get(one.code, ROWS[one.code])

@@ -11,6 +11,8 @@ z across the plane of the first two and the next that is off their line.
 
 Cameras on the tool are in the flange frame: the base frame of the arm as seen from its last joint back, so z
 along the last joint. Their pose there is the hand–eye transformation. The markers are points of the base.
+
+By poses of the flange the base and the flange are those of the robot, in its metres.
 """
 
 from collections.abc import Callable, Sequence
@@ -32,6 +34,7 @@ from projservo_cli.geometry.displacements import (
     screws,
     twists,
 )
+from projservo_cli.geometry.flange import FlangeChart
 from projservo_cli.geometry.joint_curve import true_joints
 from projservo_cli.geometry.lens import TERMS, undistort
 from projservo_cli.geometry.stereo import triangulate_points
@@ -64,6 +67,7 @@ _ALL_PARALLEL = (
     "metric: within their noise all revolute axes are parallel, which leaves the stretch along them open: a "
     "revolute joint about another direction would fix it"
 )
+_MIRRORED = "metric: one camera's images are mirrored: turn its flip off, and record again"
 
 Scale = str | Sequence[int]
 
@@ -312,6 +316,35 @@ def _bodies(models: ProjectiveParameters, c: Calibration, face: Sequence[int]) -
     )
 
 
+def _bodies_by_flange(models: ProjectiveParameters, c: Calibration, chart: FlangeChart) -> MetricParameters:
+    """Bodies (B, …) of models in the base of poses of a flange, m, and markers in the flange or the base."""
+    G = _to_known(models.H_hat, chart.H_hat)
+    G = G * np.sign(models.M[:, :1] @ G[:, 3, :, None])
+    M = models.M @ G.swapaxes(-1, -2)
+    points = M[..., :3] / M[..., 3:]
+    of_cameras, of_markers = (chart.T, np.eye(4)) if c.mount == TOOL else (np.eye(4), chart.T)
+    P = models.P @ np.linalg.inv(G)[:, None]
+    depth = (P[:, :, 2] @ homogeneous(points).swapaxes(-1, -2)).mean(axis=-1)
+    side = np.sign(np.linalg.det(P[..., :3]) * depth)
+    if (side[0] < 0.0).any():
+        raise WorkFailed(_MIRRORED)
+    P = P * np.sign(depth)[..., None, None] @ of_cameras
+    P /= np.linalg.norm(P[..., 2, :3], axis=-1)[..., None, None]
+    markers = (homogeneous(points) @ rigid_inverse(of_markers).T)[..., :3]
+    B = len(P)
+    axes = np.broadcast_to(screws(chart.H_hat), (B, 6, 6)).copy()
+    return MetricParameters(P, models.lens, axes, np.broadcast_to(chart.T, (B, 4, 4)).copy(), markers)
+
+
+def _to_known(H_hat: FloatArray, known: FloatArray) -> FloatArray:
+    """Homographies (B, 4, 4) of unit norm that turn operators (B, n, 4, 4) into known ones (n, 4, 4)."""
+    rows = np.einsum("bnjk,ai->bnaikj", H_hat, np.eye(4)) - np.einsum("nai,jk->naikj", known, np.eye(4))
+    B = len(H_hat)
+    # W Ĥ − K W = 0, row by row of W: of the entry (a, k), by the unknown (i, j).
+    rows = rows.transpose(0, 1, 2, 4, 3, 5).reshape(B, -1, 16)
+    return np.asarray(np.linalg.svd(rows)[2][:, -1].reshape(B, 4, 4))
+
+
 def _right_handed(models: ProjectiveParameters, G: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Upgrades (B, 4, 4) to a right-handed frame, and markers (B, m, 3) there.
 
@@ -324,7 +357,7 @@ def _right_handed(models: ProjectiveParameters, G: FloatArray) -> tuple[FloatArr
     depth = (P[:, :, 2] @ homogeneous(points).swapaxes(-1, -2)).mean(axis=-1)
     side = np.sign(np.linalg.det(P[..., :3]) * depth)
     if (side[0] != side[0, 0]).any():
-        raise WorkFailed("metric: one camera's images are mirrored: turn its flip off, and record again")
+        raise WorkFailed(_MIRRORED)
     flip = np.ones((len(G), 4))
     flip[:, 0] = side[:, 0]
     return flip[:, :, None] * G, points * flip[:, None, :3]
@@ -380,6 +413,16 @@ def _require_squares(lengths: FloatArray, sides: Sequence[tuple[int, int]]) -> N
         )
 
 
+def _require_metres(length: float, known: FloatArray, between: Scale) -> None:
+    """Refuse a length beside poses of a flange, which are in metres, saying how it compares; known : (B,)."""
+    std, off = float(np.linalg.norm(changes_of(known))), 100.0 * (float(known[0]) / length - 1.0)
+    raise InputError(
+        f"metric: poses of the flange are in metres, and by them the length between {between} is "
+        f"{known[0]:.5g} ± {std:.2g} m, {abs(off):.2g} % {'more' if off > 0.0 else 'less'} than the "
+        f"{length:g} m given: leave the length out (--metric); if they differ, one of them errs"
+    )
+
+
 @dataclass(frozen=True, eq=False)
 class Metric:
     """A calibration in metres, in the base frame of the arm: its arrays, and functions with covariances.
@@ -398,6 +441,7 @@ class Metric:
     range: FloatArray  # (n, 2) readings in the data, rad or m
     q_reference: FloatArray  # (n,) readings of the reference, rad or m
     curve: JointCurve | None  # true joints by readings; frames at readings of zero are those of true zeros
+    by_flange: bool = False  # whether readings are poses of the flange, in the base of the robot
 
     @classmethod
     def of(
@@ -430,7 +474,10 @@ class Metric:
         lens = c.model().lens
         models = ProjectiveParameters.around(c, lens, factor)
         try:
-            bodies = _bodies(models, c, list(chosen))
+            chart = FlangeChart.from_optional(c.flange_chart)
+            bodies = (
+                _bodies(models, c, list(chosen)) if chart is None else _bodies_by_flange(models, c, chart)
+            )
             K = bodies.intrinsics()
         except np.linalg.LinAlgError:
             raise InputError(_ALL_PARALLEL) from None
@@ -438,6 +485,8 @@ class Metric:
         if np.sqrt((change**2).sum(axis=(0, 2, 3))).min() > 2.0 * _STEP * _UNDETERMINED:
             raise InputError(_ALL_PARALLEL)
         known = _length_of(bodies, between, marker, c.prismatic)
+        if chart is not None and between != "joint":
+            _require_metres(length, known, between)
         if not known[0] > 0.0:
             raise InputError(f"metric: the markers {between} of the known length are one point")
         bodies = bodies.scaled(length / known)
@@ -449,7 +498,7 @@ class Metric:
             parts = zip(bodies, off, strict=True)
             bodies = MetricParameters(*(np.concatenate([b[:cut], o[:1], b[cut:], o[1:]]) for b, o in parts))
         moved = np.stack([c.joint_min, c.joint_min + c.excitation], axis=1)
-        moved_by = c.q_reference, c.curve
+        moved_by = c.q_reference, c.curve, chart is not None
         return cls(c.view, c.mount, c.joint_types, marker, c.sigma_px, bodies, moved, *moved_by)
 
     @property

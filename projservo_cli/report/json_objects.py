@@ -110,7 +110,7 @@ def _law(trace: Trace) -> dict[str, Any]:
 
 
 def _calibration(run: Run, names: Sequence[str | None]) -> dict[str, Any]:
-    calibration = run.calibration
+    calibration, by_flange = run.calibration, run.calibration.flange_chart is not None
     joints = [
         {
             "name": (names[i] if i < len(names) else None) or f"q{i + 1}",
@@ -153,7 +153,8 @@ def _calibration(run: Run, names: Sequence[str | None]) -> dict[str, Any]:
     }
     if calibration.joint_curve is not None:
         values["joint_model"] = describe_curve(calibration)
-    return values | {"joints": joints, "lens": lens} | findings(calibration) | held_out
+    values |= {"readings": "flange" if by_flange else "joints", "joints": [] if by_flange else joints}
+    return values | {"lens": lens} | findings(calibration) | held_out
 
 
 def _in_words(one: Finding, calibration: Calibration) -> dict[str, Any]:

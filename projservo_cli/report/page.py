@@ -43,7 +43,8 @@ def _calibration_words(values: Mapping[str, Any], *, estimated: bool) -> Iterato
             f"degrees of freedom; where model and noise are true it stays within {low} and {high}."
             + (" The noise is itself an estimate from these images." if estimated else "")
         )
-    yield _worst_joint(values)
+    if values["joints"]:
+        yield _worst_joint(values)
     if "cross_validation" in values:
         held_out = values["cross_validation"]
         names = ("rms_px", "predicted_rms_px", "median_px", "p95_px")

@@ -53,8 +53,8 @@ class Data(Section):
     table: Text = Field(description="path of the table, relative to the configuration")
     readings: Text | None = Field(
         None,
-        description="path of a table of joints, pose and q1 ... qN, where table lists the detections of any "
-        "cameras: pose, camera, marker, u, v",
+        description="path of a table of joints, pose and q1 ... qN, or of poses of the flange, where table "
+        "lists the detections of any cameras: pose, camera, marker, u, v",
     )
     joints: Annotated[str, StringConstraints(pattern=r"^[RrPp]+$"), AfterValidator(str.upper)] | None = Field(
         None,

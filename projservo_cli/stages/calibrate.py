@@ -14,6 +14,7 @@ from projservo_cli.calibration.initial.initialization import Nominal
 from projservo_cli.calibration.pipeline import calibrate
 from projservo_cli.calibration.refit import refit, since_moved
 from projservo_cli.calibration.robust_fit import Solution
+from projservo_cli.geometry.flange import FlangeChart
 from projservo_cli.geometry.lens import K1
 from projservo_cli.messages import lines, with_findings
 from projservo_cli.messages.rows_by_code import Setup
@@ -42,6 +43,7 @@ from projservo_cli.stages.stage_inputs import (
     Trials,
 )
 from projservo_cli.store.files_and_locks import write_whole
+from projservo_cli.store.flange_poses import pose_columns
 from projservo_cli.store.nominal_robot import read_nominal
 from projservo_cli.store.observation_tables import mount_in, read_detections, read_table, to_csv
 
@@ -73,7 +75,11 @@ def _refitted(inputs: RefitInputs, before: _Calibrated) -> _Calibrated:
     old, calibration, _ = before
     kind, path = (calibration.joint_types, inputs.joint_unit), inputs.file.path
     readings = inputs.readings
-    seen = read_table(path, *kind) if readings is None else read_detections(path, readings.path, *kind)
+    seen = (
+        read_table(path, *kind, like=calibration)
+        if readings is None
+        else read_detections(path, readings.path, *kind, like=calibration)
+    )
     found = refit(calibration, seen, inputs.view, inputs.image_size, inputs.max_predicted_px)
     return since_moved(old, seen, inputs.view), found, None
 
@@ -164,7 +170,8 @@ def estimate(
             calibration = fitted_to(board.observation)
     except WorkFailed as error:
         found = [*screening.findings, *board.findings]
-        setup = Setup(seen.mount, board.observation.view, len(seen.joint_types))
+        by_flange = seen.flange_chart is not None
+        setup = Setup(seen.mount, board.observation.view, len(seen.joint_types), by_flange)
         words, findings = "; ".join((str(error), *lines(found, setup))), (*error.findings, *found)
         raise type(error)(words, findings=findings) from error
     calibration = changed(
@@ -187,7 +194,8 @@ def suggest_motions(
 
     Predictions are judged over the range of the recorded readings, a little widened. Candidates lie in
     the same range, or for a simulated robot in one three times as wide. ``path`` becomes a list of motions, a
-    row each: q1 … qN, from_pose, delta_q1 … delta_qN, revolute joints in the unit of the recorded table.
+    row each: q1 … qN, from_pose, delta_q1 … delta_qN, revolute joints in the unit of the recorded table; or
+    x, y, z, qx, qy, qz, qw of the flange.
     """
     observation = observation.at_rest
     limits = inputs.joints.joints("R" * observation.q.shape[1]).limits
@@ -196,6 +204,11 @@ def suggest_motions(
     candidates = targets if inputs.recorded else region_around(observation, *within, FARTHER)
     rng = generator(inputs.seed, SUGGESTIONS)
     found = suggest(calibration, observation, candidates, targets, count, rng)
+    chart = FlangeChart.from_optional(calibration.flange_chart)
+    if chart is not None:
+        columns = pose_columns(chart.poses(np.array([one.q for one in found])))
+        write_whole(path, to_csv(columns | {"from_pose": np.array([one.from_pose for one in found])}))
+        return found
     turn = np.degrees(1.0) if inputs.unit == "deg" else 1.0
     scale = np.array([turn if kind == "R" else 1.0 for kind in calibration.joint_types])
     joints = [f"q{i}" for i in range(1, len(scale) + 1)]

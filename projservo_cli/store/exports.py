@@ -70,21 +70,39 @@ def _points(metric: Metric) -> FloatArray:
 def urdf(metric: Metric, names: Sequence[str], limits: FloatArray) -> str:
     """The arm, its tool and the cameras as a URDF, with limits (n, 2) of its joints, rad or m.
 
-    All link frames are parallel to the base at readings of zero. Cameras on the tool are on the flange.
+    All link frames are parallel to the base at readings of zero. Cameras on the tool are on the flange. By
+    poses of the flange this floats in the base, without joints.
     Raises InputError for joints that do not turn as they read.
     """
     _require_ideal(metric, "URDF")
-    places, prismatic = _points(metric), metric.prismatic
-    hand = FLANGE if metric.mount == TOOL else _TOOL
-    links = [_BASE, *(f"link_{i + 1}" for i in range(len(places))), hand]
-    links += [f"camera_{view}" for view in metric.view]
+    hand = FLANGE if metric.by_flange or metric.mount == TOOL else _TOOL
+    joints = [] if metric.by_flange else [f"link_{i + 1}" for i in range(len(metric.axes))]
+    cameras = [f"camera_{view}" for view in metric.view]
     lines = ['<?xml version="1.0"?>', '<robot name="calibrated">']
     # Masses, which no camera sees, for simulators that ask for some.
     lines += ['  <mujoco><compiler boundmass="0.001" boundinertia="1e-6" fusestatic="false"/></mujoco>']
-    lines += [f'  <link name="{link}"/>' for link in links]
-    last = np.zeros(3)
+    lines += [f'  <link name="{link}"/>' for link in (_BASE, *joints, hand, *cameras)]
+    if metric.by_flange:
+        lines += [
+            f'  <joint name="{hand}_pose" type="floating">',
+            f'    <parent link="{_BASE}"/><child link="{hand}"/>',
+            "  </joint>",
+        ]
+    else:
+        lines += _urdf_joints(metric, [_BASE, *joints], hand, names, limits)
+    carrier = hand if metric.mount == TOOL else _BASE
+    for link, T in zip(cameras, metric.poses, strict=True):
+        lines += _fixed(carrier, link, T)
+    return "\n".join([*lines, "</robot>"]) + "\n"
+
+
+def _urdf_joints(
+    metric: Metric, links: Sequence[str], hand: str, names: Sequence[str], limits: FloatArray
+) -> list[str]:
+    """Joints of an arm between links, and what the last of these carries."""
+    places, lines, last = _points(metric), list[str](), np.zeros(3)
     for i, (place, screw) in enumerate(zip(places, metric.axes, strict=True)):
-        kind, axis = ("prismatic", screw[3:]) if prismatic[i] else ("revolute", screw[:3])
+        kind, axis = ("prismatic", screw[3:]) if metric.prismatic[i] else ("revolute", screw[:3])
         axis, (low, high) = axis / np.linalg.norm(axis), limits[i].tolist()
         lines += [
             f'  <joint name={quoteattr(names[i])} type="{kind}">',
@@ -96,18 +114,18 @@ def urdf(metric: Metric, names: Sequence[str], limits: FloatArray) -> str:
         last = place
     tool = metric.pose(np.zeros(len(places)))
     tool[:3, 3] -= last
-    carrier = hand if metric.mount == TOOL else _BASE
-    parents = (links[len(places)], *(carrier for _ in metric.view))
-    fixed = zip(links[len(places) + 1 :], parents, (tool, *metric.poses), strict=True)
-    for link, parent, T in fixed:
-        rpy = Rotation.from_matrix(T[:3, :3]).as_euler("xyz")
-        lines += [
-            f'  <joint name="{link}_fixed" type="fixed">',
-            f'    <parent link="{parent}"/><child link="{link}"/>',
-            f'    <origin xyz="{_numbers(T[:3, 3])}" rpy="{_numbers(rpy)}"/>',
-            "  </joint>",
-        ]
-    return "\n".join([*lines, "</robot>"]) + "\n"
+    return [*lines, *_fixed(links[-1], hand, tool)]
+
+
+def _fixed(parent: str, link: str, T: FloatArray) -> list[str]:
+    """A fixed joint of a pose (4, 4), m."""
+    rpy = Rotation.from_matrix(T[:3, :3]).as_euler("xyz")
+    return [
+        f'  <joint name="{link}_fixed" type="fixed">',
+        f'    <parent link="{parent}"/><child link="{link}"/>',
+        f'    <origin xyz="{_numbers(T[:3, 3])}" rpy="{_numbers(rpy)}"/>',
+        "  </joint>",
+    ]
 
 
 def _require_ideal(metric: Metric, kind: str) -> None:

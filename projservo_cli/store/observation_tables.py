@@ -24,6 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from projservo_cli.calibration.time_offset import require_seconds
+from projservo_cli.geometry.flange import FLANGE_TYPES, FlangeChart
 from projservo_cli.image_size import view_named, views_in_order
 from projservo_cli.metric.position_error import Positions
 from projservo_cli.records import (
@@ -33,6 +34,7 @@ from projservo_cli.records import (
     VIEW_NAME,
     VIEWS,
     WORLD,
+    Calibration,
     FloatArray,
     InputError,
     IntArray,
@@ -40,6 +42,14 @@ from projservo_cli.records import (
     Observation,
 )
 from projservo_cli.store.files_and_locks import lines_of, write_whole
+from projservo_cli.store.flange_poses import (
+    FORMS,
+    coordinates_of,
+    flange_columns,
+    pose_columns,
+    poses_of,
+    require_joints,
+)
 
 _MAX_JOINTS = 64  # maximum number of joints, as in a configuration
 _MAX_COLUMNS = 10_000  # maximum number of columns
@@ -66,18 +76,23 @@ def read_table(
     joint_unit: str | None = None,
     *,
     frame: str | None = None,
+    like: Calibration | None = None,
 ) -> Observation:
-    """Read an observation table.
+    """Read an observation table, by joint readings or by poses of the flange.
 
     path : file, or the name of a frame.
     frame : text of a frame that is in no file; messages count its rows from 0.
     joint_types : one letter a joint column, R or P, by default all R.
     joint_unit : unit of the revolute columns, ``deg`` or ``rad``; by default rad, and readings beyond two
         turns are refused as a mistaken unit.
+    like : calibration whose readings these must be like, poses of the flange in the same coordinates.
     Returns poses in the order of their first row, markers by number; NaN if unseen; readings in rad and m.
     Raises InputError ``file:line: message`` if the file cannot be read or a row is not valid.
     """
-    sheet = _Sheet(path, ["pose", "marker"], joint_types, optional=[_MOVING, _T_Q], frame=frame, seen=True)
+    optional = [_MOVING, _T_Q]
+    sheet = _Sheet(
+        path, ["pose", "marker"], joint_types, optional=optional, frame=frame, seen=True, flange=True
+    )
     stated = sheet.has_all([f"sigma_{view}" for view in sheet.views])
     times_of = [_T_Q, *(f"t_{view}" for view in sheet.views)]
     readings: dict[int, tuple[int, dict[str, float | None]]] = {}
@@ -117,10 +132,12 @@ def read_table(
         np.array([[of_pose.get(name) for name in names] for of_pose in values], dtype=np.float64)
         for names in (sheet.joints, (_MOVING,), times_of)
     )
+    q, chart = sheet.readings(numbers, q_read, joint_unit, [line for line, _ in readings.values()], like)
     found = Observation(
         pose=numbers,
         marker=markers,
-        q=sheet.in_radians(numbers, q_read, joint_unit),
+        q=q,
+        flange_chart=chart,
         images=images,
         view=sheet.views,
         moving=moving[:, 0].astype(np.int64) if np.nansum(moving) > 0.0 else None,
@@ -133,17 +150,23 @@ def read_table(
 
 
 def read_detections(
-    path: Path | str, readings: Path | str, joint_types: str | None = None, joint_unit: str | None = None
+    path: Path | str,
+    readings: Path | str,
+    joint_types: str | None = None,
+    joint_unit: str | None = None,
+    *,
+    like: Calibration | None = None,
 ) -> Observation:
-    """Read a list of detections of any cameras, ``pose, camera, marker, u, v``, beside a table of joints.
+    """Read a list of detections of any cameras, ``pose, camera, marker, u, v``, beside a table of readings.
 
     Optional columns: ``sigma``, px, and ``t``, s, the time of an image. Views are the cameras: left, right,
     then all others by name, c2 before c10; one whose name is a number n is cam n. Poses of the table of
     joints that no row names are poses that no camera saw.
-    readings : table of joints, ``pose, q1 … qN``; joint_types, joint_unit : as for an observation table.
+    readings : table of joints, ``pose, q1 … qN``, or of poses of the flange; joint_types, joint_unit, like :
+        as for an observation table.
     Raises InputError ``file:line: message`` if a file cannot be read or a row is not valid.
     """
-    joints = read_joint_list(readings, joint_types, joint_unit)
+    joints = read_joint_list(readings, joint_types, joint_unit, flange=True, like=like)
     sheet = _Sheet(path, _DETECTION, optional=["sigma", "t"], joints=False)
     poses = {int(pose): k for k, pose in enumerate(joints.pose)}
     views: dict[str, int] = {}
@@ -189,6 +212,7 @@ def read_detections(
         pose=joints.pose,
         marker=markers,
         q=joints.q,
+        flange_chart=joints.flange_chart,
         images=images,
         view=tuple(names),
         t_view=t_view if np.isfinite(t_view).any() else None,
@@ -201,15 +225,19 @@ def read_joint_list(
     joint_types: str | None = None,
     joint_unit: str | None = None,
     view: Sequence[str] = VIEWS,
+    *,
+    flange: bool = False,
+    like: Calibration | None = None,
 ) -> JointList:
     """Read a list of joint readings, one pose a row: columns ``q1 … qN``, optionally ``pose, left, right``.
 
     view : names of the views, which columns with names of their images have; by default left and right.
     joint_types : as for an observation table.
     joint_unit : ``deg`` or ``rad`` as for an observation table; with ``rad`` readings stay as they are.
+    flange : whether poses of the flange may stand for them; like : as for an observation table.
     Raises InputError ``file:line: message`` if the file cannot be read or a row is not valid.
     """
-    sheet = _Sheet(path, [], joint_types, optional=["pose", *view], unread=view)
+    sheet = _Sheet(path, [], joint_types, optional=["pose", *view], unread=view, flange=flange)
     named = sheet.has_all(view)
     lines: dict[int, int] = {}
     readings, names = [], []
@@ -226,9 +254,10 @@ def read_joint_list(
             )
     sheet.require(readings, "a pose")
     poses = np.array([*lines], dtype=np.int64)
-    q = sheet.in_radians(poses, np.array(readings), joint_unit)
+    q, chart = sheet.readings(poses, np.array(readings), joint_unit, [*lines.values()], like)
     images = dict(zip(view, zip(*names, strict=True), strict=True)) if named else None
-    return JointList(pose=poses, q=q, numbered="pose" in sheet.columns, images=images)
+    numbered = "pose" in sheet.columns
+    return JointList(pose=poses, q=q, numbered=numbered, images=images, flange_chart=chart)
 
 
 def read_positions(path: Path | str, joint_types: str, joint_unit: str | None = None) -> Positions:
@@ -300,7 +329,10 @@ def table_text(
     """
     K, m = len(observation.pose), len(observation.marker)
     columns = {"pose": np.repeat(observation.pose, m), "marker": np.tile(observation.marker, K)}
-    columns |= {f"q{i}": np.repeat(values, m) for i, values in enumerate(observation.q.T, 1)}
+    readings = {f"q{i}": values for i, values in enumerate(observation.q.T, 1)}
+    if observation.flange_chart is not None:
+        readings = pose_columns(FlangeChart.from_record(observation.flange_chart).poses(observation.q))
+    columns |= {name: np.repeat(values, m) for name, values in readings.items()}
     for v, view in enumerate(observation.view):
         for name, pixels in zip("uv", observation.images[:, v].reshape(K * m, 2).T, strict=True):
             columns[f"{name}_{view}"] = or_empty(pixels)
@@ -470,6 +502,7 @@ class _Sheet:
         frame: str | None = None,
         seen: bool = False,
         joints: bool = True,
+        flange: bool = False,
         unread: Sequence[str] = (),
     ) -> None:
         self.file, self._of_frame = str(path), frame is not None
@@ -487,6 +520,8 @@ class _Sheet:
             raise InputError(f"{self.file}: the table is empty; expected a header {','.join(expected)}")
         names = [unicodedata.normalize("NFC", name.strip().lower()) for name in header]
         self.joints = sorted(filter(_JOINT.fullmatch, set(names)), key=lambda name: int(name[1:]))
+        self.flange = self._flange_columns(names) if flange and not self.joints else ()
+        self.joints = [*self.flange] or self.joints
         self.views = _views_in(names) if seen else ()
         needed = [*needed, *_columns_of(self.views)]
         optional = [*optional, *(f"{what}_{view}" for view in self.views for what in ("sigma", "t"))]
@@ -497,6 +532,13 @@ class _Sheet:
         self._width, self._numeric = len(names), {*wanted} - {*unread, "camera", _RECORDING, _MOUNT}
         self.columns = {name: names.index(name) for name in wanted}
         self._joint_types = joint_types or "R" * len(self.joints)
+
+    def _flange_columns(self, names: Sequence[str]) -> tuple[str, ...]:
+        """Columns of poses of the flange in the header, if there are any."""
+        try:
+            return flange_columns(names)
+        except InputError as error:
+            raise InputError(f"{self._place(1 + self._skipped)}: {error}") from None
 
     def _wrong(
         self,
@@ -515,11 +557,15 @@ class _Sheet:
         if missing := [name for name in needed if name not in names] + ["q1"] * (joints and not n):
             listed = "camera" in names and "camera" not in needed
             other = "; a list of detections has its joints in another table: give --readings" * listed
+            other += f"; poses of the flange have {FORMS}" * (missing == ["q1"])
             return f"the header lacks the column(s) {', '.join(missing)}{other}"
         if twice := sorted({name for name in wanted if names.count(name) > 1}):
             return f"the header names the column(s) {', '.join(twice)} more than once"
         if n > _MAX_JOINTS:
             return f"{n} joint columns; a robot has at most {_MAX_JOINTS}"
+        if self.flange:
+            types = f"joints {joint_types!r}: poses of the flange have no types; leave joints out"
+            return "" if joint_types in (None, FLANGE_TYPES) else types
         if gaps := [f"q{i}" for i in range(1, n + 1) if f"q{i}" not in self.joints]:
             return f"joint column {gaps[0]} is missing, though there is {self.joints[-1]}"
         if joint_types is not None and len(joint_types) != n:
@@ -576,6 +622,24 @@ class _Sheet:
         except csv.Error as error:
             place = self._place(self._reader.line_num + self._skipped)
             raise InputError(f"{place}: {error}; expected values between {self._separator!r}") from error
+
+    def readings(
+        self,
+        pose: IntArray,
+        values: FloatArray,
+        unit: str | None,
+        lines: Sequence[int],
+        like: Calibration | None,
+    ) -> tuple[FloatArray, FloatArray | None]:
+        """Joint readings (K, n), rad and m, or coordinates of poses of the flange, and the chart of these.
+
+        lines : (K,) of the rows; like : calibration whose readings these must be like.
+        """
+        if not self.flange:
+            require_joints(self.file, like)
+            return self.in_radians(pose, values, unit), None
+        where = [self._place(line) for line in lines]
+        return coordinates_of(poses_of(self.flange, values, where), self.file, like)
 
     def in_radians(self, pose: IntArray, q: FloatArray, unit: str | None) -> FloatArray:
         """Convert readings (K, n) to rad and m, as ``in_radians``."""

@@ -16,9 +16,11 @@ from docs.generate.regions import GROUPS
 from projservo_cli import cli
 from projservo_cli.config import load_config
 from projservo_cli.messages.rows_by_code import ROWS
+from projservo_cli.records import TOOL
 from projservo_cli.report import animation as film
 from projservo_cli.report.figures import FIGURES
 from projservo_cli.simulation.mjcf import mujoco
+from tests.calibration.flange import write_recording
 from tests.configured import draw_only, truth_of
 from tests.detection.rendering import render, square
 from tests.documentation.blocks import PAGES, ROOT, blocks_of, run_page
@@ -103,6 +105,13 @@ def put_hand(folder):
     from tests.studies.hand_eye_coverage import write_recording
 
     write_recording("one", folder)
+
+
+def put_poses(folder):
+    """Two recordings by a camera on a flange, with its poses."""
+    rng = np.random.default_rng(2)
+    write_recording(folder, TOOL, rng)
+    write_recording(folder, TOOL, rng, ("new", "new_poses"), 8)
 
 
 def require_gl():
@@ -249,6 +258,7 @@ def check_paper(folder, names, read):
 
 HAS = {
     "camera-on-the-hand": (put_hand,),
+    "flange-poses": (put_poses,),
     "print-and-mount-tags": (put_tags,),
     "observation-tables": (put_sheet,),
     "robot-class": (put_truth,),

@@ -12,6 +12,7 @@ from itertools import combinations, islice, permutations
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from projservo_cli.calibration.bundle_adjustment import LeastSquares, minimize
 from projservo_cli.calibration.checks.image_contradictions import size_changes
@@ -21,6 +22,8 @@ from projservo_cli.calibration.detections import Detections, even_choice
 from projservo_cli.calibration.initial.initialization import Search, bodies, starting_markers, starts
 from projservo_cli.calibration.robust_fit import Solution, fit_from
 from projservo_cli.findings import REFUSES, Finding, Subject
+from projservo_cli.geometry.displacements import rigid_inverse
+from projservo_cli.geometry.flange import FlangeChart
 from projservo_cli.records import TOOL, WORLD, FloatArray, WorkFailed, letters_of
 
 # Number of relabellings of a kind that are fitted completely, and minimum share of detections that fit them.
@@ -230,11 +233,37 @@ def _sizes(data: _Data) -> Iterator[Relabelling]:
         yield data.with_("image_size_changed", subject, "1", factor, pixels=pixels)
 
 
+def _poses(data: _Data) -> Iterator[Relabelling]:
+    """Poses of the base in the flange, rotations by columns, or quaternions with w first."""
+    d, chart = data.detections, data.detections.chart
+    assert chart is not None
+    sense = -1.0 if d.mount == TOOL else 1.0
+    T = chart.poses(sense * d.q[:, :: int(sense)])
+    R = Rotation.from_matrix(T[:, :3, :3])
+    for code, other in (
+        ("inverse_poses", rigid_inverse(T)),
+        ("transposed_rotations", _with_rotations(T, R.inv())),
+        ("scalar_first", _with_rotations(T, Rotation.from_quat(np.roll(R.as_quat(), -1, axis=1)))),
+    ):
+        there = FlangeChart.of(other)
+        q = np.ascontiguousarray(sense * there.coordinates(other)[:, :: int(sense)])
+        yield data.with_(code, Subject(), q=q, chart=there)
+
+
+def _with_rotations(T: FloatArray, R: Rotation) -> FloatArray:
+    """Poses (K, 4, 4) with other rotations."""
+    other = T.copy()
+    other[:, :3, :3] = R.as_matrix()
+    return other
+
+
 # What makes a relabelling exact that was tried with one of many numbers, by a fit with it.
 _NEARER = dict.fromkeys(_SHIFTED, (_Data.dated,)) | {"tracker_memory": (_Data.sharper,) * 3}
 # All relabellings by which the same images may fit: the simple ones first, then those by which more would.
 SIMPLE = (_mounts, _orders_of_images, _types, _standing)
 OTHERS = (_exchanged, _couplings, _parallelograms, _units, _sizes, _images_shifted_from, _memories)
+# Those of poses of the flange, which are no joints.
+OF_POSES = ((_mounts, _orders_of_images, _poses), (_sizes, _images_shifted_from, _memories))
 
 
 def relabelled(
@@ -254,7 +283,7 @@ def relabelled(
     if straight is not None:
         types = list(_types(data))
         return _best(data, search, max_px, [types[i] for i in straight])
-    for kinds in (SIMPLE, OTHERS):
+    for kinds in (SIMPLE, OTHERS) if detections.chart is None else OF_POSES:
         found = _best(data, search, max_px, [one for kind in kinds for one in kind(data)])
         if found is not None:
             return found
@@ -273,7 +302,7 @@ def _best(data: _Data, search: Search, max_px: float, tried: Sequence[Relabellin
             there = dataclasses.replace(search, problem=problem)
             for start in islice(starts(there, one.detections, known=same), 1):
                 params = minimize(
-                    problem, start, seen, robust=True, cameras=False, max_steps=_SCREW_STEPS
+                    problem, start, seen, robust=True, cameras=start.known_arm, max_steps=_SCREW_STEPS
                 ).params
                 # In logarithms neither a few gross errors nor many small ones outweigh the rest.
                 level = np.mean(np.log(np.linalg.norm(problem.residual(params)[seen], axis=1) + 1e-9))

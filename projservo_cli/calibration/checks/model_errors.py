@@ -216,6 +216,8 @@ def _of_readings(
     for i, (kind, row) in product(range(n), DEVIATIONS.items()):
         if (row.turns and params.prismatic[i]) or 2.0 * extent.half[i] < row.range_rad:
             continue
+        if detections.chart is not None and not (kind == "scale" and params.prismatic[i]):
+            continue  # turns of a flange are of no gear
         if row.curve:
             for by in [j for j in range(n) if j != i] if row.part == PAIR else [i]:
                 of_joint(kind, i, by_curve(row, i, by), *([by] if by != i else []))
@@ -226,7 +228,7 @@ def _of_readings(
                 of_joint(kind, i, unit[i] * waves, period=2.0 * extent.half[i] / cycles)
         elif row.part == JOINT:  # a zero that changes with time
             of_joint(kind, i, np.full((len(q), 1), unit[i]))
-    if n > 1:
+    if n > 1 and detections.chart is None:
         columns = G * q[detections.pose_of][:, None]
         found.append(_Nuisance("scale", tuple(range(n)), None, columns))
     return found

@@ -1,5 +1,6 @@
 """Quality of a calibration: observability of joints, errors of predictions, and findings."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -326,7 +327,8 @@ def _joint_noise(solution: Solution) -> Iterator[Finding]:
         return
     over, moved_px = solution.joint_effect()
     subject = Subject(name="ticks" if noise.ticks else "")
-    found = Finding("joint_noise", NOTE, subject, noise.sigma_q, unit="rad", effect_px=moved_px)
+    places = noise.sigma_m if solution.problem.detections.chart is not None else math.nan
+    found = Finding("joint_noise", NOTE, subject, noise.sigma_q, limit=places, unit="rad", effect_px=moved_px)
     if over > 1.0:
         yield replace(found, code="coarse_joints", severity=LIMITS)
     yield found

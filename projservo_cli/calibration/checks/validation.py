@@ -12,9 +12,9 @@ from scipy.sparse.csgraph import connected_components
 from projservo_cli.calibration.checks.board_corner_numbering import BoardNumbering
 from projservo_cli.calibration.checks.observability_and_verdict import UNDETERMINED_NOISE
 from projservo_cli.calibration.checks.screening import without_placeholders
-from projservo_cli.calibration.detections import SAME_READING, Detections, per_rad, require_motion
+from projservo_cli.calibration.detections import SAME_READING, Detections, require_motion
 from projservo_cli.calibration.initial.epipolar import Epipolar
-from projservo_cli.calibration.prediction import joint_derivative, predict, prediction_variance
+from projservo_cli.calibration.prediction import predict, prediction_variance, reading_changes
 from projservo_cli.calibration.robust_fit import WARN_RATIO, Solution, fit_inliers
 from projservo_cli.findings import LIMITS, NOTE, REFUSES, Finding, Subject
 from projservo_cli.geometry.lens import undistort
@@ -321,9 +321,9 @@ def residual_statistics(calibration: Calibration, observation: Observation) -> d
     if found["count"]:
         of_pairs = prediction_variance(calibration, observation.q).sum(axis=-1)[:, :, order]
         of_readings = np.zeros_like(of_pairs)
-        if sigma_q := calibration.sigma_q:  # these readings have their own noise
-            J = joint_derivative(calibration, observation.q)[:, :, order] * per_rad(calibration.prismatic)
-            of_readings = sigma_q**2 * (J**2).sum(axis=(-2, -1))
+        if calibration.sigma_q:  # these readings have their own noise
+            J = reading_changes(calibration, observation.q)[:, :, order]
+            of_readings = (J**2).sum(axis=(-2, -1))
         of_images = _image_noise(calibration, observation)
         stated = float(np.sqrt(np.median(of_pairs[compared])))
         noise = float(np.hypot(of_images, np.sqrt(np.median(of_readings[compared]))))

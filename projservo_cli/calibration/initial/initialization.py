@@ -5,6 +5,7 @@ A nominal robot and rig may serve as a start too; it is tried, and kept only if 
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +15,7 @@ from projservo_cli.calibration.bundle_adjustment import LeastSquares
 from projservo_cli.calibration.detections import Detections, cauchy_weights, per_block, robust_deviation
 from projservo_cli.calibration.initial.epipolar import ImageFrame, ImageGeometry, log_distances, marker_pairs
 from projservo_cli.calibration.prediction import Parameters
-from projservo_cli.geometry.displacements import aligned, cross_matrix
+from projservo_cli.geometry.displacements import aligned, cross_matrix, displacements, homogeneous
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
 from projservo_cli.geometry.least_squares import Equations, levenberg_marquardt
 from projservo_cli.records import (
@@ -81,6 +82,12 @@ _WIDTH = 0.05
 _RIDGE = 0.03
 # Minimum width of the loss on points, over their distance, so that the bias of the ridge rejects no motion.
 _MIN_SCALE = 1e-3
+# Angle of a rotation, rad, above which noise may turn its vector over.
+_HALF_TURN = 2.8
+# Root mean square rotation across the main axis, rad, below which poses turn about one axis.
+_SAME_AXIS = 0.03
+# Turns of the base that are tried where no pose turns.
+_ALL_TURNS = Rotation.create_group("O").as_matrix()
 
 
 def stationary(detections: Detections, noise_px: float) -> BoolArray:
@@ -396,10 +403,85 @@ def starts(
     for factor in factors:
         for body in bodies(search, detections, factor) if known is None else known:
             some, rigid = detections.rows(body.placed), np.isfinite(body.alignment.body[:, 0])
+            if some.chart is not None:
+                yield from _of_flange(body, some, rigid)
+                continue
             for w in _rotation_axes(body.alignment, search.problem.q, some.prismatic, search.rng):
                 params = _solve_points(w, (body.P, body.points), some, search.problem.q, rigid)
                 if np.isfinite(params.H_hat).all() and np.isfinite(params.M).all():
                     yield params
+
+
+def _of_flange(body: GuessedBody, detections: Detections, rigid: BoolArray) -> Iterator[Parameters]:
+    """Yield initial parameters in the base by poses of the flange.
+
+    The turn of the base follows from the rotations in closed form; points are linear in its place and scale.
+    Without rotations about two axes several turns are tried, best first.
+    """
+    H_hat, q, prismatic = detections.known_operators, detections.q, detections.prismatic
+    assert H_hat is not None
+    motion = reduce(np.matmul, displacements(H_hat, prismatic, q))
+    found = [
+        _placed_in_base(C, motion, (body.P, body.points), detections, rigid)
+        for C in _turns_of_base(motion[:, :3, :3], body.alignment)
+    ]
+    for _, (P, M) in sorted((one for one in found if one is not None), key=lambda one: one[0]):
+        yield Parameters(P, H_hat, prismatic, M, known_arm=True)
+
+
+def _turns_of_base(D: FloatArray, alignment: _Alignment) -> Iterator[FloatArray]:
+    """Yield rotations (3, 3) of the base into the frame of an alignment, by those of the flange (K, 3, 3).
+
+    Rotation vectors of the flange and of the body between two poses are equal but for this rotation.
+    Source: F. C. Park, B. J. Martin, "Robot sensor calibration: solving AX = XB on the Euclidean group",
+    IEEE Trans. Robotics and Automation 10(5), 1994.
+    """
+    known = np.flatnonzero(alignment.merged)
+    a, b = (known[at] for at in np.triu_indices(len(known), 1))
+    flange, body = (_rotation_vectors(R[a] @ R[b].swapaxes(1, 2)) for R in (D, alignment.R))
+    angle = np.linalg.norm(flange, axis=1)
+    used = angle < _HALF_TURN
+    flange, body, weight = flange[used], body[used], np.ones(np.count_nonzero(used))
+    for _ in range(_ROUNDS):
+        U, _, Vt = np.linalg.svd(body.T @ (weight[:, None] * flange))
+        C = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
+        off = np.linalg.norm(body - flange @ C.T, axis=1)
+        weight = cauchy_weights((off / (2.0 * robust_deviation(off, _WIDTH))) ** 2)
+    values, vectors = np.linalg.eigh((weight[:, None] * flange).T @ flange / max(weight.sum(), 1e-12))
+    if values[1] > _SAME_AXIS**2:
+        yield C
+    elif values[2] > _SAME_AXIS**2:
+        for angle in np.arange(0.0, 2.0 * np.pi, np.pi / 8.0):
+            yield C @ _rotations(angle * vectors[:, 2])
+    else:
+        yield from np.asarray(_ALL_TURNS)
+
+
+def _placed_in_base(
+    C: FloatArray,
+    motion: FloatArray,
+    guess: tuple[FloatArray, FloatArray],
+    detections: Detections,
+    rigid: BoolArray,
+) -> tuple[float, tuple[FloatArray, FloatArray]] | None:
+    """Median distance, and cameras and markers in the base; None if the scale is not positive.
+
+    A point of marker j at pose k is s C (R_k X_j + d_k) + t. Turned back by C R_k, the unknown s X_j is the
+    mean of the remaining residuals.
+    """
+    (P, points), pose_of, marker_of = guess, detections.pose_of, detections.marker_of
+    turned, d = C @ motion[:, :3, :3], motion[:, :3, 3]
+    back = turned.swapaxes(1, 2)
+    rows = np.concatenate([(back @ (d @ C.T)[..., None]), back], axis=2)[pose_of]
+    center = np.median(points, axis=0)
+    target = (back[pose_of] @ (points - center)[..., None])[..., 0]
+    x, X = _robust_solve(rows, target, np.full(4, 1e-9 * len(points)), marker_of, rigid)
+    if not x[0] > 0.0:
+        return None
+    off = np.linalg.norm(target - (rows @ x) - X[marker_of], axis=1)
+    frame = np.eye(4)
+    frame[:3, :3], frame[:3, 3] = x[0] * C, x[1:] + center
+    return float(np.median(off)), (P @ frame, homogeneous(X / x[0]))
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,197 @@
+"""Poses of the flange instead of joint readings."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
+
+from projservo_cli.calibration.pipeline import calibrate
+from projservo_cli.calibration.prediction import predict
+from projservo_cli.geometry.displacements import cross_matrix, rigid, rigid_inverse
+from projservo_cli.geometry.flange import FLANGE_TYPES, FlangeChart
+from projservo_cli.records import TOOL, WORLD, InputError, Observation, WorkFailed
+from projservo_cli.results import ImageModel
+from projservo_cli.store.observation_tables import read_detections, read_joint_list
+from tests.calibration.flange import HAND, K, images, poses
+from tests.conftest import SHARED
+
+
+def observed(T, seen):
+    """Observation of images at poses."""
+    chart, count = FlangeChart.of(T), np.arange(len(T))
+    q, marker = chart.coordinates(T), np.arange(seen.shape[2])
+    return Observation(count, marker, q, seen, view=("eye",), flange_chart=chart.record)
+
+
+def fitted(T, seen, mount, **how):
+    """Calibration from poses and images."""
+    return calibrate(observed(T, seen), FLANGE_TYPES, mount=mount, source="recorded", joint_noise=None, **how)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_coordinates_of_any_pose_are_exact_and_errors_of_poses_are_twists(seed):
+    rng = np.random.default_rng(seed)
+    T = np.array([rigid(R, rng.normal(size=3)) for R in Rotation.random(12, rng=rng)])
+    chart = FlangeChart.from_record(FlangeChart.of(T).record)
+    q = chart.coordinates(T)
+    np.testing.assert_allclose(chart.poses(q), T, atol=1e-12)
+    step, by_twist = 1e-7, chart.by_twist(q)
+    for i in range(6):
+        v, w = np.split(np.eye(6)[i], 2)
+        twist = np.zeros((4, 4))
+        twist[:3, :3], twist[:3, 3] = cross_matrix(w), v
+        moved = (chart.coordinates(T @ expm(step * twist)) - q) / step
+        # A middle turn near 90° bends coordinates: the second order grows as its cosine to the power of −3.
+        np.testing.assert_allclose(moved, by_twist[:, :, i], atol=2e-6 / np.cos(q[:, 4]).min() ** 3)
+
+
+@pytest.mark.parametrize("mount", [WORLD, TOOL])
+def test_a_camera_is_where_it_is_and_new_poses_are_predicted_at_the_bound(mount):
+    """Within four standard deviations of its own covariance, without a known length."""
+    rng = np.random.default_rng(3)
+    T = poses(rng)
+    found = fitted(T, images(T, mount, rng, 0.3), mount)
+    assert found.usable
+    metric = ImageModel.of(found).metric()
+    truth = HAND if mount == TOOL else rigid(Rotation.from_rotvec([0.0, 0.0, 0.1]), [0.5, 0.0, -0.5])
+    off = rigid_inverse(truth) @ metric.poses[0]
+    std = np.sqrt(np.diagonal(metric.covariance("poses")[0]))
+    assert np.linalg.norm(off[:3, 3]) < 4.0 * np.linalg.norm(std[3:])
+    assert np.linalg.norm(Rotation.from_matrix(off[:3, :3]).as_rotvec()) < 4.0 * np.linalg.norm(std[:3])
+    np.testing.assert_allclose(metric.K[0], K, atol=4.0 * np.sqrt(metric.covariance("K")[0].max()))
+    there = poses(rng, 40)
+    chart = FlangeChart.from_record(found.flange_chart)
+    error = predict(found, chart.coordinates(there)) - images(there, mount, rng, 0.0)
+    rms = np.sqrt(np.mean(np.sum(error**2, axis=-1)))
+    assert rms < 1.5 * found.predicted_rms_px
+
+
+@pytest.mark.parametrize("mount", [WORLD, TOOL])
+def test_errors_of_poses_have_a_place_and_a_turn(mount):
+    """Of 2 mm and 1 mrad, whose ratio is not that of joints; to a third, by 60 poses of six numbers each."""
+    rng = np.random.default_rng(5)
+    T = poses(rng, 60)
+    seen = images(T, mount, rng, 0.2)
+    turns = Rotation.from_rotvec(1e-3 * rng.standard_normal((60, 3)))
+    T = T @ np.array([rigid(R, t) for R, t in zip(turns, 2e-3 * rng.standard_normal((60, 3)), strict=True)])
+    found = fitted(T, seen, mount)
+    assert found.sigma_flange_m == pytest.approx(2e-3, rel=0.35)
+    assert found.sigma_q == pytest.approx(1e-3, rel=0.35)
+    assert found.fit.sigma_fitted_px == pytest.approx(0.2, rel=0.1)
+
+
+def inverse(T):
+    return rigid_inverse(T)
+
+
+def transposed(T):
+    other = T.copy()
+    other[:, :3, :3] = T[:, :3, :3].swapaxes(1, 2)
+    return other
+
+
+def scalar_first(T):
+    other = T.copy()
+    quaternion = np.roll(Rotation.from_matrix(T[:, :3, :3]).as_quat(), 1, axis=1)
+    other[:, :3, :3] = Rotation.from_quat(quaternion).as_matrix()
+    return other
+
+
+@pytest.mark.parametrize(
+    ("wrong", "code", "mount"),
+    [
+        (inverse, "inverse_poses", WORLD),
+        (transposed, "transposed_rotations", TOOL),
+        (scalar_first, "scalar_first", WORLD),
+    ],
+)
+def test_poses_that_are_read_otherwise_are_named(wrong, code, mount):
+    rng = np.random.default_rng(7)
+    T = poses(rng)
+    seen = images(T, mount, rng, 0.3)
+    with pytest.raises(WorkFailed) as failure:
+        fitted(wrong(T), seen, mount)
+    assert failure.value.findings[0].code == code
+    assert "joint" not in str(failure.value)
+
+
+@pytest.mark.parametrize(
+    ("header", "row", "message"),
+    [
+        ("x,y,z,qx,qy,qz,qw", "0,0,0,0,0,0,0.9", "length 0.9, not 1"),
+        ("x,y,z,qx,qy,qz,qw", "400,0,0,0,0,0,1", "looks like millimetres"),
+        ("x,y,z,rx,ry,rz", "0,0,0,90,0,0", "as in degrees"),
+        ("T11,T12,T13,T14,T21,T22,T23,T24,T31,T32,T33,T34", "1,0,0,0,0,1,0,0,0,0,0.9,0", "not orthogonal"),
+        ("T11,T12,T13,T14,T21,T22,T23,T24,T31,T32,T33,T34", "1,0,0,0,0,1,0,0,0,0,-1,0", "mirrors"),
+        ("x,y,z", "0,0,0", "poses of the flange have"),
+        ("x,y,z,qx,qy,qz,qw,rx,ry,rz", "0,0,0,0,0,0,1,0,0,0", "2 forms"),
+    ],
+)
+def test_rows_that_are_no_poses_are_refused_by_line(tmp_path, header, row, message):
+    table = tmp_path / "poses.csv"
+    table.write_text(f"pose,{header}\n0,{row}\n")
+    with pytest.raises(InputError, match=message) as failure:
+        read_joint_list(table, flange=True)
+    assert f"{table}:" in str(failure.value)
+
+
+def test_all_forms_of_a_pose_are_one(tmp_path):
+    T = poses(np.random.default_rng(1), 3)
+    R = Rotation.from_matrix(T[:, :3, :3])
+    forms = {
+        "x,y,z,qx,qy,qz,qw": np.c_[T[:, :3, 3], -R.as_quat()],
+        "x_mm,y_mm,z_mm,rx,ry,rz": np.c_[1e3 * T[:, :3, 3], R.as_rotvec()],
+        ",".join(f"T{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3, 4)): T[:, :3].reshape(3, 12),
+    }
+    for header, rows in forms.items():
+        table = tmp_path / "poses.csv"
+        np.savetxt(
+            table, np.c_[np.arange(3), rows], fmt="%.17g", delimiter=",", header=f"pose,{header}", comments=""
+        )
+        found = read_joint_list(table, flange=True)
+        there = FlangeChart.from_record(found.flange_chart).poses(found.q)
+        np.testing.assert_allclose(there, T, atol=1e-12)
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="no data of others beside the project")
+@pytest.mark.parametrize(("folder", "mount", "bound_px"), [("fixed", WORLD, 0.101), ("hand", TOOL, 0.118)])
+def test_poses_of_others_predict_held_out_images_at_the_bound(projservo, tmp_path, folder, mount, bound_px):
+    """Bounds of these designs with points free; the command line finds the camera where it is."""
+    data, run = SHARED / "flange" / folder, str(tmp_path / "run")
+    trained = "--data", str(data / "train.csv"), "--readings", str(data / "train_poses.csv")
+    found = projservo("calibrate", *trained, "--mount", mount, "-o", run, "--json")
+    value = json.loads(found.out)
+    assert (found.code, value["readings"], value["joints"], value["usable"]) == (0, "flange", [], True)
+    new = "--data", str(data / "test.csv"), "--readings", str(data / "test_poses.csv")
+    assert json.loads(projservo("validate", run, *new, "--json").out)["rms_px"] <= 1.1 * bound_px
+    kinds = [projservo("export", run, "--to", kind).code for kind in ("opencv", "ros", "urdf", "json")]
+    assert kinds == [0, 0, 0, 0]
+    metric = json.loads((tmp_path / "run" / "json" / "metric.json").read_text())
+    truth = json.loads((data / "truth.json").read_text())
+    camera = truth["cameras"]["cam"] if mount == WORLD else truth["camera_in_flange"]
+    np.testing.assert_allclose(np.array(metric["poses"][0])[:3, 3], np.array(camera)[:3, 3], atol=4e-3)
+    contradicted = projservo("export", run, "--to", "ros", "--metric", "0.03", "--between", "0,1", "--force")
+    assert contradicted.code == 2
+    assert "less than the 0.03 m given" in contradicted.err
+    by_joints = tmp_path / "joints.csv"
+    shutil.copy(SHARED / "board" / "train_joints.csv", by_joints)
+    other = projservo("validate", run, "--data", new[1], "--readings", str(by_joints))
+    assert other.code == 2
+    assert "by poses of the flange" in other.err
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="no data of others beside the project")
+def test_real_poses_are_calibrated_with_their_errors():
+    """Of a real arm: its images agree to 0.1 px with bodies that poses place to some 0.4 mm and 1.2 mrad."""
+    data = SHARED / "charuco_poses"
+    seen = read_detections(data / "detections.csv", data / "poses.csv")
+    found = calibrate(
+        seen, FLANGE_TYPES, source="recorded", joint_noise=None, lens=True, image_size=(1600, 1200)
+    )
+    assert found.usable
+    assert found.fit.sigma_fitted_px < 0.1
+    assert 5e-4 < found.sigma_q < 2e-3
+    assert 1e-4 < found.sigma_flange_m < 1e-3
