@@ -25,6 +25,7 @@ _DONE, FAILED, _MALFORMED, _INTERRUPTED = 0, 1, 2, 130
 _COMPLETE = "_PROJSERVO_COMPLETE"
 _COMING = threading.Event()  # an interrupt that was lost and is raised again
 _LEFT_OUT = {"--suggest": "5"}  # default number of an option
+_FORMER = {"detect": {"--joints-csv": "--readings"}}  # former names of options, which work on
 
 
 class _Stage(click.Command):
@@ -120,6 +121,9 @@ class _Group(click.Group):
             if taken[-1:] == ["--"]:
                 return [*words, *left], taken[:-1], flags
             words += left[:1]
+        former = {old: new for name, names in _FORMER.items() if name in args for old, new in names.items()}
+        for i, (name, equals, value) in enumerate(word.partition("=") for word in rest):
+            rest[i] = f"{former.get(name, name)}{equals}{value}"
             rest = left[1:]
         return words, taken, flags
 

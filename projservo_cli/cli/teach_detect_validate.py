@@ -163,12 +163,12 @@ def _print_taught(console: Console, path: Path, taught: Any, check: Any, setting
 
 
 @main.command(
-    "detect", epilog="Example: projservo detect images/left images/right --joints-csv q.csv --output tags.csv"
+    "detect", epilog="Example: projservo detect images/left images/right --readings q.csv --output tags.csv"
 )
 @click.argument("images", nargs=-1, required=True, metavar="LEFT RIGHT | NAME=IMAGES...")
 @option.output(metavar="TABLE", help="Observation table to write (CSV).", required=True)
 @click.option(
-    "--joints-csv",
+    "--readings",
     metavar="CSV",
     type=click.Path(),
     required=True,
@@ -201,7 +201,7 @@ def _detect(
     *,
     images: tuple[str, ...],
     output: Path,
-    joints_csv: str,
+    readings: str,
     dictionary: str,
     board: str | None,
     points: str,
@@ -215,7 +215,7 @@ def _detect(
 
     Other rigs name their cameras, one or more: top=images/top, or left=a right=b top=c.
 
-    The list of joint readings (--joints-csv) says which images belong together. With columns left and right
+    The list of joint readings (--readings) says which images belong together. With columns left and right
     (or other names), these are the names of the images. With a column pose, images are those whose name ends
     in that number. With neither, all folders are taken in the order of their names, one image a row; image_2
     comes before image_10.
@@ -237,8 +237,8 @@ def _detect(
     finder = finder_of(None if board is None else Board.of(board), dictionary)
     sources = _sources(images)
     # Readings as they are, whatever their unit.
-    joints = read_joint_list(joints_csv, joint_unit="rad", view=tuple(sources))
-    pairs = pair_images(sources, joints, joints_csv)
+    joints = read_joint_list(readings, joint_unit="rad", view=tuple(sources))
+    pairs = pair_images(sources, joints, readings)
     hidden = [file for side in sources.values() for file in hidden_images(side)]
     if hidden:
         console.say(

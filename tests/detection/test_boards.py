@@ -91,7 +91,7 @@ def test_case_36_a_chessboard_under_speckle_is_found_less_certain(projservo, sha
     if not case.is_dir():
         pytest.skip(f"case not found at {case}")
     answer = projservo(
-        *("detect", f"left={case / 'im'}", "--joints-csv", case / "q.csv", "--board", "chessboard:11x8"),
+        *("detect", f"left={case / 'im'}", "--readings", case / "q.csv", "--board", "chessboard:11x8"),
         *("-o", tmp_path / "t.csv", "--json"),
     )
     assert (answer.code, answer.json["unseen"] < 13) == (0, True), answer.err  # of 264
@@ -124,7 +124,7 @@ def test_images_of_a_symmetric_board_calibrate_a_robot(projservo, monkeypatch, t
             np.testing.assert_allclose(true, pixels, atol=1e-6)
             write(f"{side}/{k}.png", image)
     joints("pose,q1,q2,q3", *(",".join(map(repr, [k, *row.tolist()])) for k, row in enumerate(q)))
-    command = ["detect", "left", "right", "--joints-csv", "q.csv", "--board", str(board), "-o", "t.csv"]
+    command = ["detect", "left", "right", "--readings", "q.csv", "--board", str(board), "-o", "t.csv"]
     answer = projservo(*command, "--json")
     assert answer.code == 0, answer.err
     assert (answer.json["board"], answer.json["tags"], answer.json["markers"]) == ("chessboard:7x5", [], 35)
@@ -202,7 +202,7 @@ def test_a_board_whose_tags_begin_at_another_number(projservo, rng, monkeypatch,
     write("mirror/0.png", image[:, ::-1].copy())
     joints("q1", "1")
     given = (
-        *("detect", "--joints-csv", "q.csv", "-o", "t.csv", "--dictionary", "4X4_250", "--board"),
+        *("detect", "--readings", "q.csv", "-o", "t.csv", "--dictionary", "4X4_250", "--board"),
         str(board),
     )
     assert projservo(*given, "top=a").code == 0
@@ -225,7 +225,7 @@ def test_case_37_mirrored_tags(projservo, shared_data, tmp_path):
     if not case.is_dir():
         pytest.skip(f"case not found at {case}")
     answer = projservo(
-        "detect", f"left={case / 'im'}", "--joints-csv", case / "q.csv", "-o", tmp_path / "t.csv"
+        "detect", f"left={case / 'im'}", "--readings", case / "q.csv", "-o", tmp_path / "t.csv"
     )
     assert (answer.code, answer.err.count("\n")) == (1, 1)
     assert "the left images are mirrored: 2 of 2 show tags in the mirror, and none as they are" in answer.err
@@ -249,7 +249,7 @@ def test_boards_that_are_not_there(projservo, monkeypatch, tmp_path, options):
     for side in ("l", "r"):
         write(f"{side}/0.png", np.full((60, 80), 99, dtype=np.uint8))
     joints("q1", "1")
-    answer = projservo("detect", "l", "r", "--joints-csv", "q.csv", "-o", "t.csv", "-q", *options.split())
+    answer = projservo("detect", "l", "r", "--readings", "q.csv", "-o", "t.csv", "-q", *options.split())
     assert (answer.code, answer.err.count("\n")) == (1 if "any of" in REFUSED[options] else 2, 1), answer.err
     assert REFUSED[options] in answer.err
     assert not Path("t.csv").exists()

@@ -111,7 +111,7 @@ def test_images_alone_calibrate_a_robot_to_hundredths_of_a_pixel(projservo, rng)
     truth = truth_of(config)
     trials = trial_motions(config)
     corners = show(truth, trials, rng)
-    command = ["detect", "left", "right", "--joints-csv", "q.csv"]
+    command = ["detect", "left", "right", "--readings", "q.csv"]
     answer = projservo(*command, "--output", "trials.csv", "--json")
     assert answer.code == 0, answer.err
     assert (answer.json["poses"], answer.json["tags"], answer.json["markers"]) == (len(trials), [0, 5, 9], 12)
@@ -175,7 +175,7 @@ def test_images_and_readings_belong_together(projservo, monkeypatch, name):
     read = []
     original = TagFinder.read
     monkeypatch.setattr(TagFinder, "read", lambda self, path: read.append(path.stem) or original(self, path))
-    answer = projservo("detect", "l/*.png", "r", "--joints-csv", "q.csv", "-o", "t.csv")
+    answer = projservo("detect", "l/*.png", "r", "--readings", "q.csv", "-o", "t.csv")
     assert answer.code == 0, answer.err
     table = read_table("t.csv")
     assert (table.pose.tolist(), table.q[:, 0].tolist()) == (poses, readings)
@@ -187,7 +187,7 @@ def test_images_of_any_cameras_are_found_by_their_names(projservo, view):
     put([f"{name}/{k}.png" for name in view for k in range(2)])
     joints(f"q1,{','.join(view)}", *(",".join([f"{k}", *[f"{1 - k}.png"] * len(view)]) for k in range(2)))
     sources = [f"{name}={name}" for name in view]
-    answer = projservo("detect", *sources, "--joints-csv", "q.csv", "-o", "t.csv", "--json")
+    answer = projservo("detect", *sources, "--readings", "q.csv", "-o", "t.csv", "--json")
     assert answer.code == 0, answer.err
     table = read_table("t.csv")
     assert table.view == view
@@ -199,7 +199,7 @@ def test_images_of_any_cameras_are_found_by_their_names(projservo, view):
         ([sources[0], sources[0]], "two cameras have one name"),
         (["top=top", "Low 2=top", "low=top"], "Low 2=top: give the images"),
     ]:
-        answer = projservo("detect", *wrong, "--joints-csv", "q.csv", "-o", "w.csv")
+        answer = projservo("detect", *wrong, "--readings", "q.csv", "-o", "w.csv")
         assert (answer.code, message in answer.err) == (2, True)
 
 
@@ -231,7 +231,7 @@ def test_images_that_make_no_table(projservo, name):
             Path(f"l/{other}.png").unlink()
     Path("r/b.txt").write_text("no image")
     joints(*rows)
-    answer = projservo("detect", "l", "r", "--joints-csv", "q.csv", "-o", "t.csv", "-q")
+    answer = projservo("detect", "l", "r", "--joints-csv=q.csv", "-o", "t.csv", "-q")  # its former name
     assert (answer.code, answer.err.count("\n")) == (code, 1), answer.err
     assert message in answer.err
     assert not Path("t.csv").exists()
