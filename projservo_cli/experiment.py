@@ -3,6 +3,7 @@
 A chain stops at the first failure and keeps finished results; results that are up to date stay.
 """
 
+import difflib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -268,6 +269,8 @@ def law_target(name: str) -> str:
     if target is None:
         if remedy := mode_in(name):
             raise InputError(f"law {name}: {remedy}")
-        valid = ", ".join((*CODES, *plugins.registered_names("law")))
-        raise InputError(f"law {name}: no such law; laws: {valid}, or module:Class")
+        valid = (*CODES, *plugins.registered_names("law"))
+        close = difflib.get_close_matches(name, valid, n=1)
+        hint = f"did you mean {close[0]}? " if close else ""
+        raise InputError(f"law {name}: no such law; {hint}laws: {', '.join(valid)}, or module:Class")
     return target

@@ -81,8 +81,15 @@ class _Group(click.Group):
         used = {_flag(param) for name in ctx.obj for param in self.commands[name].get_params(ctx)}
         unused = [flag for flag in flags if flag not in used]
         if unused and not ctx.resilient_parsing:
-            raise click.UsageError(f"{', '.join(unused)}: not used by {' '.join(ctx.obj)}")
+            where = "; ".join(
+                f"{flag} is of {', '.join(self._taking(flag))}" for flag in dict.fromkeys(unused)
+            )
+            raise click.UsageError(f"{', '.join(unused)}: not used by {' '.join(ctx.obj)}; {where}")
         return super().parse_args(ctx, [*ctx.obj[:1], *options, *(["--", *arguments] if arguments else [])])
+
+    def _taking(self, flag: str) -> list[str]:
+        """Names of the commands that take an option."""
+        return [name for name, one in self.commands.items() if flag in map(_flag, one.params)]
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
@@ -114,6 +121,9 @@ class _Group(click.Group):
             f"{word}={_LEFT_OUT[word]}" if word in _LEFT_OUT and not following.isdecimal() else word
             for word, following in zip(args, [*args[1:], ""], strict=True)
         ]
+        former = {old: new for name, names in _FORMER.items() if name in args for old, new in names.items()}
+        for i, (name, equals, value) in enumerate(word.partition("=") for word in rest):
+            rest[i] = f"{former.get(name, name)}{equals}{value}"
         while rest:
             _, left, read = every.make_parser(ctx).parse_args(list(rest))
             flags += map(_flag, read)
@@ -121,9 +131,6 @@ class _Group(click.Group):
             if taken[-1:] == ["--"]:
                 return [*words, *left], taken[:-1], flags
             words += left[:1]
-        former = {old: new for name, names in _FORMER.items() if name in args for old, new in names.items()}
-        for i, (name, equals, value) in enumerate(word.partition("=") for word in rest):
-            rest[i] = f"{former.get(name, name)}{equals}{value}"
             rest = left[1:]
         return words, taken, flags
 

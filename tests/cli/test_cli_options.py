@@ -94,8 +94,12 @@ RECORDED, TINY = ["calibrate", "--data", "t.csv"], ["calibrate", "-c", "tiny.yam
 USAGE = {
     "unknown command": (["calibrat"], "did you mean calibrate?"),
     "only options": (["--json"], "no command"),
-    "law of a stage without laws": (["calibrate", "--law", "stacked"], "--law: not used by calibrate"),
-    "unknown law": (["servo", "--law", "direct_four"], "laws: direct_three, direct_two, stacked"),
+    "law of a stage without laws": (
+        ["calibrate", "--law", "stacked"],
+        "--law: not used by calibrate; --law is of servo\n",
+    ),
+    "unknown law": (["servo", "--law", "mine"], "no such law; laws: direct_three, direct_two, stacked"),
+    "misspelt law": (["servo", "--law", "exat"], "--law exat: no such law; did you mean exact? laws: "),
     "law with its mode": (
         ["servo", "--law", "exact_track"],
         "--law exact_track: is the run of exact in mode track: name exact, with --set control.mode=[track]",
