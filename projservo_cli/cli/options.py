@@ -147,7 +147,7 @@ def configured(
 def say_unnamed(console: Console) -> None:
     """Say, once, that a call names no configuration, where it takes that which is shipped."""
     if click.get_current_context().meta.pop(_UNNAMED, False):
-        console.say("configuration: paper.yaml, which is shipped, since none is named (-c FILE)")
+        console.say("configuration: paper.yaml, as shipped; projservo init writes yours (-c FILE)")
 
 
 def calibrated_run(run: Path | None, config: "Config") -> "Run | None":

@@ -79,6 +79,7 @@ _MAX_BYTES = 1_000_000
 _MAX_VALUES = 50_000  # aliases counted as often as they are used
 _MAX_DEPTH = 32
 _MOST_LINES = 50  # of error messages
+_EXPECTED = "a configuration (YAML), which projservo init writes"
 _STANDARD = "tag:yaml.org,2002:"
 _Model = TypeVar("_Model", bound=Section)
 
@@ -133,7 +134,7 @@ class _Document:
         self.problems.append((path, what, place))
 
     @classmethod
-    def read(cls, path: pathlib.Path | str, expected: str = "a configuration (YAML)") -> "_Document":
+    def read(cls, path: pathlib.Path | str, expected: str = _EXPECTED) -> "_Document":
         """The document in a file; an InputError where there is none."""
         return cls(text_of(path, expected, _MAX_BYTES), str(path))
 
@@ -483,7 +484,7 @@ def to_goals(what: str, goals: Sequence[str]) -> list[Override]:
 
 def load_sweep(path: pathlib.Path | str, overrides: Sequence[str] = ()) -> SweepConfig:
     """Read and check the configuration of a sweep; ``base`` becomes absolute paths."""
-    document = _Document.read(path)
+    document = _Document.read(path, "a configuration of a sweep (YAML)")
     if not isinstance(document.values, dict):
         if not document.problems:
             document.wrong((), "expected keys and values such as base: paper.yaml")

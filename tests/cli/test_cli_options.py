@@ -148,7 +148,10 @@ USAGE = {
     "no yaml": (["init", "mine.json"], "mine.yaml"),
     "confirmed by nobody": (["servo", "--confirm"], "no terminal"),
     "no poses": (["calibrate", "--suggest", "0"], "--suggest"),
-    "no configuration": (["plan", "-c", "none.yaml"], "none.yaml: cannot be read"),
+    "no configuration": (
+        ["plan", "-c", "none.yaml"],
+        "expected a configuration (YAML), which projservo init writes\n",
+    ),
     "no table": ([*RECORDED[:2], "none.csv"], "which projservo record calibrate makes"),
     "other letters": ([*RECORDED, "--joints", "RX"], "--joints RX: data.joints: 'RX' must be"),
     "no noise at all": ([*RECORDED, "--noise-px", "0"], "--noise-px 0.0: data.noise_px: must be"),

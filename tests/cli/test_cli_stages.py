@@ -284,7 +284,7 @@ def test_a_refit_begins_at_the_stored_calibration_and_is_up_to_date_in_the_new_r
 
 
 def test_a_call_that_names_no_configuration_says_which_it_takes(projservo, stages):
-    said = "configuration: paper.yaml, which is shipped, since none is named (-c FILE)\n"
+    said = "configuration: paper.yaml, as shipped; projservo init writes yours (-c FILE)\n"
     assert projservo("plan", "-o", "out").err.count(said) == 1
     for named in (("-o", "out"), ("-c", "tiny.yaml", "-o", "own"), ("-o", "other", "-q")):
         assert said not in projservo("plan", *named).err
