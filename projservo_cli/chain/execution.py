@@ -1,7 +1,7 @@
 """A chain of stages: their order and permission, results made and saved, and findings of a call."""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import KW_ONLY, InitVar, dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,9 +20,10 @@ from projservo_cli.laws import CODES, codes_of, fault_fails, law_and_mode, must_
 from projservo_cli.loop.jit_notice import compilation
 from projservo_cli.messages import failed, sentence_and_remedy
 from projservo_cli.messages.verdicts import arrived, meaning
+from projservo_cli.observations import Observations
 from projservo_cli.records import InputError, Plan, WorkFailed
 from projservo_cli.result_hashes import digest
-from projservo_cli.stages.stage_inputs import PlanInputs
+from projservo_cli.stages.stage_inputs import PlanInputs, Table
 from projservo_cli.store.run_file import SERVO, Run, save
 
 FIGURES = "figures"  # folder of a run in which a killed report may have left something
@@ -57,6 +58,7 @@ class Chain:
     evidence: tuple[Finding, ...] = ()  # likewise, as data
     laws_done: tuple[str, ...] = ()
     robot: Steps = field(init=False)  # on which steps of the task are made
+    table: Observations | None = None  # of the calibration to be made, once it is read
 
     def __post_init__(self, wanted: Sequence[str], force: bool) -> None:
         stages = [name for name in self.names if name != "record"]
@@ -136,6 +138,17 @@ class Chain:
         if (servo or looks) and (target := self.config.plant.target):
             found["plant", target] = None
         return list(found)
+
+    def read(self) -> None:
+        """Read the table of a calibration that is to be made: what is wrong with it comes before all work."""
+        for step in self._outdated:
+            if step.stage == "calibrate" and self.config.recorded:
+                from projservo_cli.stages.calibrate import recorded
+
+                inputs = step.record or inputs_of("calibrate", self.config)
+                if isinstance(source := getattr(inputs, "source", None), Table):
+                    with suppress(WorkFailed):  # which making it reports
+                        self.table = recorded(source)
 
     def make(self) -> None:
         """Make the outdated results, stop at the first failure, keep finished results."""
@@ -400,7 +413,7 @@ class Chain:
             before = None
             if stored is not None and known is not None and stored.key == key_of_calibration(known):
                 before = run.observation, run.calibration, run.cross_validation
-            return calibrate.run(inputs, before, progress=progress)
+            return calibrate.run(inputs, before, self.table, progress=progress)
         if step.stage == "plan":
             from projservo_cli.stages import plan
 

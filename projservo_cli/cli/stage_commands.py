@@ -503,6 +503,7 @@ def _law_names(names: Sequence[str]) -> tuple[str, ...]:
 
 def _work(console: Console, chain: "Chain", options: Mapping[str, Any]) -> int:
     """Make the outdated stages and print their results; return the exit code."""
+    chain.read()
     _announce(console, chain)
     chain.make()
     beside: dict[str, dict[str, Any]] = {"calibrate": {}, "report": {}}  # further values of their objects

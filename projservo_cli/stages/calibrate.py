@@ -53,18 +53,22 @@ _Calibrated = tuple[Observation, Calibration, CrossValidation | None]
 def run(
     inputs: CalibrationInputs | RefitInputs,
     before: _Calibrated | None = None,
+    table: Observations | None = None,
     *,
     progress: Progress = silent,
 ) -> _Calibrated:
     """Calibrate from a recorded table or from simulated trial motions, or fit a camera again.
 
-    before : the result of the inputs before a refit, if at hand.
+    before : the result of the inputs before a refit, if at hand; table : observations of a table, likewise.
     Returns the screened observations, the calibration, and its held-out errors on request.
     """
     if isinstance(inputs, RefitInputs):
         return _refitted(inputs, before or run(inputs.before, progress=progress))
     source = inputs.source
-    seen = recorded(source) if isinstance(source, Table) else simulated(source, progress=progress)
+    if isinstance(source, Table):
+        seen = recorded(source) if table is None else table
+    else:
+        seen = simulated(source, progress=progress)
     if inputs.joint_noise is not None:
         seen = replace(seen, joint_noise=inputs.joint_noise)
     return estimate(seen, inputs.estimation, progress=progress)

@@ -59,7 +59,7 @@ class Stages:
             raise self.fails[name]
         self.made.append(name)
 
-    def calibrate(self, inputs: CalibrationInputs, before: Any = None, *, progress: Any) -> Any:
+    def calibrate(self, inputs: CalibrationInputs, before: Any, table: Any, *, progress: Any) -> Any:
         progress("trial motions", 1, 2)
         if isinstance(inputs, RefitInputs):
             self._make(f"refit of {inputs.view}")
