@@ -9,7 +9,7 @@ from projservo_cli.config import inputs as given
 from projservo_cli.config import load_config, settings_and_rules
 from projservo_cli.report import page
 from projservo_cli.settings.sections import JointVector
-from projservo_cli.simulation import faults, ground_truth, random_streams
+from projservo_cli.simulation import ground_truth, random_streams, robot_with_faults
 from projservo_cli.simulation.rendering import Frames, rendered_model
 from projservo_cli.stages import calibrate as calibrating
 from projservo_cli.stages import plan as planning
@@ -86,7 +86,7 @@ def bounds_of(config, joints):
 
 def robot_by_itself(config, truth, q, sigma_px, seed, stream):
     robot = given._drive(config, truth).robot
-    return faults.robot_by_itself(robot, q, sigma_px, (seed, stream))
+    return robot_with_faults.robot_by_itself(robot, q, sigma_px, (seed, stream))
 
 
 def rendered_of(config):
@@ -96,7 +96,7 @@ def rendered_of(config):
 
 def observed_in_frames(config, truth, q, drawn):
     scene = given.scene_of(config)
-    return faults.observed_in_frames(scene, config.noise.averaged_frames, q, drawn)
+    return robot_with_faults.observed_in_frames(scene, config.noise.averaged_frames, q, drawn)
 
 
 def eyes_of(config):

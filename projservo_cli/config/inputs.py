@@ -24,7 +24,6 @@ from projservo_cli.settings.noise_and_data import LoopNoise
 from projservo_cli.settings.objects import ObjectSettings
 from projservo_cli.settings.plant import Rest, RunConditions, ServoLimits
 from projservo_cli.settings.task import Goal as GoalSettings
-from projservo_cli.simulation.faults import SimulatedRobot
 from projservo_cli.simulation.from_settings import (
     arm_of,
     cameras_of,
@@ -34,6 +33,7 @@ from projservo_cli.simulation.from_settings import (
 from projservo_cli.simulation.ground_truth import SceneObject, Truth
 from projservo_cli.simulation.mjcf import files_named
 from projservo_cli.simulation.rendering import RenderedScene
+from projservo_cli.simulation.robot_with_faults import SimulatedRobot
 from projservo_cli.stages.stage_inputs import (
     CalibrationInputs,
     CarryingObject,

@@ -34,9 +34,9 @@ from projservo_cli.robots.contract import PluginRobot, Reading, at_rest_after
 from projservo_cli.robots.joint_limits import Joints
 from projservo_cli.robots.pacing import Steered
 from projservo_cli.robots.standstill import averaged
-from projservo_cli.simulation.faults import robot_by_itself
 from projservo_cli.simulation.ground_truth import Truth
 from projservo_cli.simulation.random_streams import CALIBRATION_NOISE, POSE_NOISE, TRIAL_POSES, generator
+from projservo_cli.simulation.robot_with_faults import robot_by_itself
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.stage_inputs import OwnRobot, RecordingInputs, Trials
 from projservo_cli.stages.worlds.external_robot import path_to, plugin_robot, simulated_robot

@@ -24,9 +24,9 @@ from projservo_cli.settings.sections import JointVector
 from projservo_cli.settings.stop_and_report import ReportSettings, Stop
 from projservo_cli.settings.task import GoalImages, TaskSettings, Trajectory
 from projservo_cli.simulation.arm import SerialArm
-from projservo_cli.simulation.faults import SimulatedRobot
 from projservo_cli.simulation.ground_truth import SceneObject, Truth
 from projservo_cli.simulation.rendering import RenderedScene
+from projservo_cli.simulation.robot_with_faults import SimulatedRobot
 from projservo_cli.store.display import About
 from projservo_cli.task.incidences import Incidence
 from projservo_cli.task.stand_off import StandOff

@@ -30,8 +30,8 @@ from projservo_cli.robots.joint_limits import Joints
 from projservo_cli.robots.standstill import observation_of_frames, seen_at_rest
 from projservo_cli.settings.sections import JointVector
 from projservo_cli.settings.task import Goal, GoalImages, TaskSettings, sigma_key
-from projservo_cli.simulation.faults import FaultyRobot, SimulatedRobot, robot_by_itself
 from projservo_cli.simulation.random_streams import TAUGHT_NOISE, generator
+from projservo_cli.simulation.robot_with_faults import FaultyRobot, SimulatedRobot, robot_by_itself
 from projservo_cli.stages import plan as planning
 from projservo_cli.stages.record import shared_markers
 from projservo_cli.stages.stage_inputs import OwnRobot, PlanInputs, TeachInputs

@@ -48,7 +48,7 @@ def test_sentences_are_short(page):
 # What a maintainer searches for, and the file below the package that defines it.
 TERMS = {
     "April ?tag": "detection",
-    "backlash": "simulation/faults",
+    "backlash": "simulation/robot_with_faults",
     "bundle adjustment": "calibration/bundle_adjustment",
     "checks?um|HDF5": "store/run_file",
     "cluster|Dask": "sweeps/workers",
@@ -61,7 +61,7 @@ TERMS = {
     "fault detection": "monitoring/__init__",
     "forward kinematics": "geometry/kinematics",
     "goal configuration": "planning/goal_configurations",
-    "gravity sag": "simulation/faults",
+    "gravity sag": "simulation/robot_with_faults",
     "ground truth": "simulation/ground_truth",
     "hypothes": "monitoring/hypotheses",
     "image-based": "control/classical",

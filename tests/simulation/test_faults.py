@@ -8,8 +8,8 @@ import pytest
 from projservo_cli.config import Config
 from projservo_cli.records import no_lenses, position_limits
 from projservo_cli.simulation.arm import SerialArm
-from projservo_cli.simulation.faults import FaultyRobot, Points, World, full_reach
 from projservo_cli.simulation.ground_truth import Truth
+from projservo_cli.simulation.robot_with_faults import FaultyRobot, Points, World, full_reach
 from tests.samples import displacement, pixels, revolute, rig
 
 PERIOD = 0.04

@@ -27,7 +27,7 @@ from projservo_cli.config import load_config
 from projservo_cli.config.inputs import scene_of
 from projservo_cli.records import WorkFailed
 from projservo_cli.simulation.arm import camera_center, inverse_kinematics
-from projservo_cli.simulation.faults import observed_in_frames, obstruction_of
+from projservo_cli.simulation.robot_with_faults import observed_in_frames, obstruction_of
 from projservo_cli.store.run_file import load
 from tests.configured import plan, robot_by_itself, servo, truth_of
 from tests.conftest import ROOT

@@ -27,8 +27,8 @@ from scipy.spatial.transform import Rotation
 from projservo_cli.records import WorkFailed
 from projservo_cli.settings.features import Feature
 from projservo_cli.settings.task import TaskStep
-from projservo_cli.simulation.faults import obstruction_of
 from projservo_cli.simulation.mjcf import mujoco
+from projservo_cli.simulation.robot_with_faults import obstruction_of
 from tests.configured import plan, robot_by_itself, servo, truth_of
 from tests.known import with_task
 from tests.studies import hand_eye

@@ -23,7 +23,7 @@ import pytest
 
 from projservo_cli.laws import REGULATE, law_and_mode
 from projservo_cli.records import WorkFailed
-from projservo_cli.simulation.faults import FaultyRobot
+from projservo_cli.simulation.robot_with_faults import FaultyRobot
 from tests.configured import calibrate, observed_in_frames, plan, record, robot_by_itself, servo, truth_of
 from tests.conftest import ROOT
 from tests.studies import hand_eye
@@ -81,7 +81,7 @@ def recorded(condition):
     """A calibration, what it is made from and how corners compare with the truth."""
     config = base_of(condition)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("projservo_cli.simulation.faults.FaultyRobot", Watched)
+        patch.setattr("projservo_cli.simulation.robot_with_faults.FaultyRobot", Watched)
         Watched.counts[:], Watched.squares[:], Watched.lens = 0.0, 0.0, condition == "lens"
         seen, calibration, why = calibrated(config)
     known = known_by_hand_eye(config, seen)

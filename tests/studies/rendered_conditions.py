@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from projservo_cli.records import FloatArray
-from projservo_cli.simulation.faults import obstruction_of
 from projservo_cli.simulation.random_tasks import STRATA, random_tasks
+from projservo_cli.simulation.robot_with_faults import obstruction_of
 from tests.configured import observed_in_frames, robot_by_itself, truth_of
 from tests.conftest import SHARED
 from tests.known import configured, with_task

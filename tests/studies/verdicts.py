@@ -12,7 +12,7 @@ import re
 import pytest
 
 from projservo_cli.records import WorkFailed
-from projservo_cli.simulation.faults import FaultyRobot
+from projservo_cli.simulation.robot_with_faults import FaultyRobot
 from tests.configured import calibrate, plan, servo
 from tests.known import configured
 from tests.studies.common import in_two_processes, parser_of, write_rows
@@ -133,7 +133,9 @@ def driven(job):
     for seed in list(SEEDS)[:count]:
         mine = task_config(config, arm, seed)
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("projservo_cli.simulation.faults.FaultyRobot", ROBOTS.get(fault, FaultyRobot))
+            patch.setattr(
+                "projservo_cli.simulation.robot_with_faults.FaultyRobot", ROBOTS.get(fault, FaultyRobot)
+            )
             try:
                 trace = servo.run(mine, calibration, plan.run(mine, calibration), "exact_track")
                 found = {"verdict": trace.verdict, "reason": trace.reason, "steps": trace.steps}

@@ -16,7 +16,7 @@ from projservo_cli.robots.joint_limits import Joints
 from projservo_cli.robots.pacing import Steered
 from projservo_cli.robots.session import Session
 from projservo_cli.robots.standstill import STILL, Standstill, at_rest
-from projservo_cli.simulation.faults import FaultyRobot, obstruction_of
+from projservo_cli.simulation.robot_with_faults import FaultyRobot, obstruction_of
 from projservo_cli.stages.stage_inputs import Drive, OwnRobot
 
 _NEVER_LATE_S = 3600.0  # for a simulated robot, whose code may be compiled first

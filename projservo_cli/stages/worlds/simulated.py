@@ -27,7 +27,6 @@ from projservo_cli.robots.pacing import Steered
 from projservo_cli.robots.session import Session
 from projservo_cli.settings.task import TaskSettings
 from projservo_cli.simulation.analytic_plant import NO_PINS, Ends, Plant, observe
-from projservo_cli.simulation.faults import FaultyRobot, Points, SimulatedRobot, observed_in_frames, robot_of
 from projservo_cli.simulation.ground_truth import SceneObject, Truth, plant_of, turned
 from projservo_cli.simulation.random_streams import (
     GOAL_FRAMES,
@@ -41,6 +40,13 @@ from projservo_cli.simulation.random_streams import (
     generator,
 )
 from projservo_cli.simulation.rendering import RenderedScene
+from projservo_cli.simulation.robot_with_faults import (
+    FaultyRobot,
+    Points,
+    SimulatedRobot,
+    observed_in_frames,
+    robot_of,
+)
 from projservo_cli.stages.stage_inputs import CarryingObject, Contract
 from projservo_cli.stages.worlds.calibrated import CalibratedWorld, TruePoses
 from projservo_cli.stages.worlds.external_robot import simulated_robot
