@@ -1,6 +1,6 @@
 """Uncalibrated stereo visual servoing in projective space.
 
-The method is that of A. Ruf and R. Horaud, "Vision-based Guidance and Control of Robots in
+The method follows A. Ruf and R. Horaud, "Vision-based Guidance and Control of Robots in
 Projective Space", ECCV 2000, cited below as [RH00].
 """
 

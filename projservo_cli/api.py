@@ -70,7 +70,7 @@ def simulate(
     ----------
     config : with a simulated robot: of points, with faults, or rendered by MuJoCo.
     q : (K, n) joint readings of the poses, rad or m; by default the trial motions of the configuration.
-    seed : of the noise; by default that of the trials. Given poses have a separate stream, so
+    seed : of the noise; by default the seed of the trials. Given poses have a separate stream, so
         that they share no noise with trials.
     noise_px : standard deviation of a coordinate, px, where points are simulated; by default
         ``noise.calibration_px``.
@@ -79,7 +79,7 @@ def simulate(
     Returns
     -------
     Observations
-        What the cameras see, NaN where unseen, with what ``calibrate`` has to know of it.
+        Images of the trial motions, NaN where unseen, with the values that ``calibrate`` needs.
 
     Raises
     ------
@@ -128,10 +128,10 @@ def record(
     Parameters
     ----------
     config : with ``markers`` and the limits of the motion; of an external robot also ``robot.limits``.
-    robot : an object of the contract; by default that of ``plant.use``, or the simulated one.
+    robot : an object of the contract; by default the robot of ``plant.use``, or the simulated one.
     path : table (CSV) that grows as the robot goes, and from which an interrupted recording is continued.
     motions : (K, n) further poses after the trial motions, rad or m.
-    force : whether to start again, whatever the table holds.
+    force : whether to start again, although the table has rows.
     progress : called as ``progress(what, done, total)``; True for a bar in a terminal, False for none.
 
     Returns
@@ -198,26 +198,27 @@ def calibrate(
     seed: int | None = None,
     progress: Progress | bool = True,
 ) -> ImageModel:
-    """Learn the projective kinematics of a robot from what cameras saw of it, [RH00] section 2.
+    """Learn the projective kinematics of a robot from its images, [RH00] section 2.
 
-    Settings are those of the section ``calibration`` of a configuration, with the same defaults.
+    Settings are as in the section ``calibration`` of a configuration, with the same defaults.
 
     Parameters
     ----------
     observations : of ``simulate``, ``record``, or of your arrays and tables.
     method : ``bundle_adjustment``, maximum likelihood, the only one.
-    lens : whether to estimate radial distortion: two coefficients a camera, and its centre where it shows.
+    lens : whether to estimate radial distortion: two coefficients a camera, and its centre if it shows.
     init : JSON file of a robot and rig known beforehand, tried first as a start.
     cross_validate : parts into which poses are divided to predict each from the others; the held-out errors
         are in ``cross_validation``.
     joint_noise_deg : rms of joint readings less true angles (of prismatic joints × 0.3 m/rad); by default
-        that of the observations, else estimated.
+        as the observations state, otherwise estimated.
     max_predicted_px : error of predictions by deviations of arm and rig from the model, px, above which the
         calibration is not usable; by default 1 % of the image size.
     joint_model : curves of the joints to fit: ``auto`` for those that the images show, or kinds such as
         ``scale``, of all or of one: ``scale:2``; a list, or a text with commas.
-    noise_px : standard deviation of a coordinate, px; by default that of the observations, else estimated.
-    seed : of the random starts; by default that of the observations.
+    noise_px : standard deviation of a coordinate, px; by default as the observations state, otherwise
+    estimated.
+    seed : of the random starts; by default the seed of the observations.
     progress : called as ``progress(what, done, total)``; True for a bar in a terminal, False for none.
 
     Returns
@@ -279,7 +280,8 @@ def plan(
         described, the calibration predicts start and goal.
     calibration : of the same robot and rig.
     q_start : (n,) joint readings at the start, rad or m; by default ``task.start``.
-    goal : (n,) joint readings, (V, m, 2) pixels of ``markers.face`` in the views of the calibration, or what
+    goal : (n,) joint readings, (V, m, 2) pixels of ``markers.face`` in the views of the calibration, or
+    results that
         ``projservo teach`` wrote, a path or a mapping; by default ``task.goal``.
 
     Returns
@@ -318,10 +320,11 @@ def servo(
     Parameters
     ----------
     config : of the robot that is driven, and of when a run ends.
-    calibration : what ``calibrate`` made.
-    plan : what ``plan`` made, whose start and goal are the task.
+    calibration : result of ``calibrate``.
+    plan : result of ``plan``; its start and goal are the task.
     law : the name of a law, ``module:Class``, or a class or function that makes one of its setup.
-    mode : ``regulate``, ``track`` or ``image_track``; by default that of the name, such as ``exact_track``,
+    mode : ``regulate``, ``track`` or ``image_track``; by default the mode in the name, such as
+    ``exact_track``,
         else ``regulate``.
     robot : an object of the contract to drive, instead of the robot of the configuration.
     blind : whether a robot may move although cameras show no marker of the calibration.
@@ -389,14 +392,14 @@ def sweep(
     tasks : number of random tasks within sight of the cameras; or a list of tasks, each joints (n,) at start
         and goal, rad or m, or a mapping of keys of ``task``; or the section ``tasks`` of a sweep; by default
         the task of the configuration alone.
-    runs : of each cell; by default one a task, or twenty.
+    runs : number per cell; by default one per task, or twenty.
     calibrations : of a cell, from noisy trials; run r is made with number r mod this.
     grid : lists of values by key, such as ``{"noise.servo_px": [0.0, 0.5]}``.
-    random : what keys are drawn from, such as ``{"noise.servo_px": {"uniform": [0, 1]}}``.
+    random : distributions of keys, such as ``{"noise.servo_px": {"uniform": [0, 1]}}``.
     seed : of all that is drawn.
     workers : processes; with more than one, laws must be importable there.
     path : folder of the sweep, which is continued there; by default all is kept in memory.
-    force : whether to start again, whatever the folder holds.
+    force : whether to start again, although the folder has runs.
     progress : called as ``progress(what, done, total)``; True for a bar in a terminal, False for none.
 
     Returns
@@ -499,13 +502,13 @@ def _require_config(what: str, config: Any, calibration: Calibration | None = No
 
 
 def _rows_of(q: npt.ArrayLike, n: int) -> FloatArray:
-    """Joint readings (K, n), rad or m, from rows or from one; an InputError for anything else."""
+    """Joint readings (K, n), rad or m, from rows or from one; an InputError for other values."""
     said = f"(K, {n}), rad or m"
     return checked_array("q", np.atleast_2d(numbers_in("q", q, said)), (None, n), said, finite=True)
 
 
 def _say_compilation(*laws: str) -> None:
-    """Say that what follows, runs of laws or none, takes as long as the compiler does."""
+    """Say that the following steps take as long as the compiler does."""
     if told := compilation(laws):
         print(told, file=sys.stderr, flush=True)
 

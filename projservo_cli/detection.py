@@ -32,7 +32,7 @@ from projservo_cli.records import (
 )
 
 DICTIONARY = "4X4_50"
-"""Of tags, where none is given."""
+"""Of tags, if none is given."""
 
 
 def cells_of(dictionary: str) -> int:
@@ -52,10 +52,11 @@ def pair_images(
     """Pair images with poses: number and the images of every pose, one of each view.
 
     sources : by the name of each view, a folder, or a pattern such as ``left/*.png``.
-    joints : the poses. Images are found by their names in the list, else by the pose number at the end of
-        their names, else in the order of their names.
+    joints : the poses. Images are found by their names in the list, otherwise by the pose number at the end
+    of
+        their names, or in the order of their names.
     where : file of the poses, for messages.
-    Raises InputError if there are no images, or that of a pose is missing or ambiguous.
+    Raises InputError if there are no images, or the image of a pose is missing or ambiguous.
     """
     poses = joints.pose.tolist()
     columns = f"column{'s' * (len(sources) > 1)} {' and '.join(sources)}"
@@ -84,7 +85,7 @@ def _images(source: str) -> list[Path]:
 
 
 def hidden_images(source: str) -> list[Path]:
-    """Hidden files of a folder or pattern with names of images, as macOS writes beside each; no images."""
+    """Hidden files of a folder or pattern with names of images, as macOS writes next to each; no images."""
     return [file for file in _images_or_not(source) if file.name.startswith(".")]
 
 
@@ -134,11 +135,12 @@ def _by_number(source: str, poses: list[int], where: str, columns: str) -> list[
     return chosen
 
 
-# Share of the mean grey value by which those of the four pixels of a cell of a Bayer mosaic differ at least.
+# Share of the mean grey value by which the values of the four pixels of a cell of a Bayer mosaic differ at
+# least.
 _MOSAIC = 0.04
 # Kinds of boards, and their minimum rows and columns.
 _BOARDS, LEAST_ROWS = ("chessboard", "charuco"), 3
-# Share of a square that a tag takes up on a ChArUco board: what OpenCV draws; the edges decide on corners.
+# Share of a square that a tag takes up on a ChArUco board: as OpenCV draws it; the edges decide on corners.
 _TAG_SHARE = 0.75
 # Minimum number of corners of a board in an image, not of one line, for the directions of its edges.
 _LEAST_CORNERS = 6
@@ -150,9 +152,9 @@ _CROSS, _MIN_CROSS = 0.1, 1.5
 _MIN_SQUARE, _UNREFINED_SADDLE = 5.0, 0.3
 # Number of parameters of a corner, steps of their fit, and error of the model, px.
 _SADDLE, _SADDLE_STEPS, _SADDLE_FLOOR = 7, 12, 0.001
-# Blur of an image in which saddles are looked for, px, their number over that of corners, and of starts.
+# Blur of an image before the search of saddles, px, their number over the number of corners, and of starts.
 _SEED_BLUR, _SADDLES, _STARTS = 1.5, 4, 40
-# Depth of the next saddle, as a share, at least, and slope of the way to it against an edge, at most.
+# Depth of the next saddle, as a share, at least, and slope of the line to it against an edge, at most.
 _FAINT, _SLOPE = 0.1, 0.2
 # Difference of a contrast, as a share, deviation, in squares, and squares beyond the known ones, at most.
 _UNLIKE, _VAGUE, _GAP = 0.6, 0.01, 3
@@ -181,7 +183,7 @@ _MAX_BLUR = 10.0
 _SPOILT = (0.2, 0.14, 0.1, 0.07, 0.05)
 # Maximum share of occluded profiles of a side.
 _SPOILT_SHARE = 0.25
-# Number of cells of border along a side of a tag, besides those of its code.
+# Number of cells of border along a side of a tag, besides the cells of its code.
 _BORDER = 2
 # Maximum number of profiles in the first fit of a side.
 _ROUGH_PROFILES = 16
@@ -214,7 +216,7 @@ _OVEREXPOSED = 0.42
 _UNREFINED = 1.2
 # Exponent of the cell width in that deviation, fitted likewise.
 _BY_CELL = -0.75
-# Blur where no edge shows it, in cells.
+# Blur if no edge shows it, in cells.
 _BLURRED = 0.4
 # Cell width below which the deviation grows no more, px.
 _MIN_UNREFINED = 1.25
@@ -247,7 +249,7 @@ class _Strips(NamedTuple):
     grey: FloatArray  # (S, C, R) grey values
     t: FloatArray  # (S, C, R) coordinate along the side, −½ to ½
     n: FloatArray  # (S, C, R) coordinate across, px
-    weight: FloatArray  # (S, C, R) one for pixels that count, else zero
+    weight: FloatArray  # (S, C, R) one for pixels that count, otherwise zero
 
     @classmethod
     def of(
@@ -265,7 +267,7 @@ class _Strips(NamedTuple):
         stride = np.maximum(1.0, np.ceil((last - first + 1.0) / max_profiles))
         profiles = int(max(2.0, ((last - first) // stride).max() + 1.0))
         half = int(np.ceil((reach / np.abs(slope)).max())) + 1
-        place = np.empty((2, len(s), profiles, 2 * half + 1))  # by main and other coordinate
+        place = np.empty((2, len(s), profiles, 2 * half + 1))  # indexed by main and other coordinate
         place[0] = (first[:, None] + stride[:, None] * np.arange(profiles))[..., None]
         t = (place[0] - sides.start[s, main][:, None, None]) / slope[:, None, None]
         crossing = sides.start[s, 1 - main][:, None, None] + sides.along[s, 1 - main][:, None, None] * t
@@ -351,7 +353,7 @@ class _Edges(NamedTuple):
 def _edges_along(image: FloatArray, all_sides: _Sides, before: FloatArray, *, rough: bool) -> _Edges:
     """Fit edges about approximate sides, from earlier edges (S, 6) or NaN.
 
-    rough : use few profiles; else all but occluded ones, if these are few.
+    rough : use few profiles; otherwise all but occluded ones, if these are few.
     The variance has the independent errors of grey values, as of the residuals of the side, and errors of the
     model: blur from the next edge, one cell away, which depends on the code, and clipped white.
     """
@@ -382,7 +384,8 @@ def _edges_along(image: FloatArray, all_sides: _Sides, before: FloatArray, *, ro
     leak = _LEAK[0] * sides.cell * ndtr(-_LEAK[1] * sides.cell / x[:, 4])
     leak *= np.maximum(1.0, _NARROW / sides.cell) ** _BY_NARROWNESS
     left_out = _FLOOR**2 + leak**2 + (_OVEREXPOSED * _clipped(strips) * x[:, 4]) ** 2
-    by_place = np.array([[1.0, -0.5, 2.0 / 3.0], [1.0, 0.5, 2.0 / 3.0]])  # of n at both ends by n_0, k, c
+    # derivatives of n at both ends by n_0, k, c
+    by_place = np.array([[1.0, -0.5, 2.0 / 3.0], [1.0, 0.5, 2.0 / 3.0]])
     C = C[:, [2, 3, 5]][:, :, [2, 3, 5]]
     ends = (by_place @ C * by_place).sum(axis=2)
     chord = x[:, 2:3] + by_place[0, 2] * x[:, 5:6]
@@ -441,7 +444,7 @@ class Corners(NamedTuple):
 
     pixels: FloatArray  # (…, 4, 2) px, in order around the tag; NaN if occluded or the guess is wrong
     sigma: FloatArray  # (…, 4) standard deviation of either coordinate, px; NaN likewise
-    clean: BoolArray  # (…, 4) whether both edges of a corner are clean; else it stays at its guess
+    clean: BoolArray  # (…, 4) whether both edges of a corner are clean; otherwise it stays at its guess
 
 
 def refine_corners(image: FloatArray, guess: FloatArray, cells: int) -> Corners:
@@ -495,7 +498,7 @@ def _unrefined(cell: FloatArray, blur: FloatArray) -> FloatArray:
 
 
 class Finder(ABC):
-    """Detector of what carries the markers: tags, or a board.
+    """Detector of the carrier of the markers: tags, or a board.
 
     ``cv``: the module of OpenCV. ``corners``: number k of markers of each; corner i of tag t is k t + i.
     Raises InputError if OpenCV is not installed.
@@ -514,7 +517,7 @@ class Finder(ABC):
         """
 
     def like(self, tags: dict[int, Corners], before: dict[int, Corners] | None) -> dict[int, Corners]:
-        """Return tags numbered as in the frame before, where a board looks the same from several ends."""
+        """Return tags numbered as in the frame before, if a board looks the same from several ends."""
         return tags
 
     def absent(self, paths: Sequence[Path]) -> Finding:
@@ -602,18 +605,18 @@ class Board(NamedTuple):
     """A board of chessboard or ChArUco corners, counted as OpenCV does."""
 
     kind: str  # chessboard or charuco
-    rows: int  # of inner corners of a chessboard, of squares of a ChArUco board
+    rows: int  # inner corners of a chessboard, squares of a ChArUco board
     columns: int
     first: int = 0  # number of the first tag on a ChArUco board
 
     @classmethod
     def of(cls, text: str) -> "Board":
-        """Read such as ``chessboard:9x7``, 9 columns and 7 rows. Raises InputError for anything else."""
+        """Read such as ``chessboard:9x7``, 9 columns and 7 rows. Raises InputError for other texts."""
         parts = re.fullmatch(rf"({'|'.join(_BOARDS)}):(\d{{1,3}})x(\d{{1,3}})(?::first=(\d{{1,4}}))?", text)
         if parts is None or min(int(parts[2]), int(parts[3])) < LEAST_ROWS:
             raise InputError(
                 f"--board {text}: write kind:columnsxrows, of {LEAST_ROWS} or more, such as chessboard:9x7 "
-                "(inner corners), charuco:11x8 (squares), or charuco:11x8:first=20 where its first tag is 20"
+                "(inner corners), charuco:11x8 (squares), or charuco:11x8:first=20 if its first tag is 20"
             )
         if parts[4] and parts[1] != "charuco":
             raise InputError(f"--board {text}: a {parts[1]} has no tags: leave out first={parts[4]}")
@@ -710,14 +713,14 @@ class BoardFinder(Finder):
                 return {0: corners}, ()
         return {}, ()
 
-    def _smooth(self, places: FloatArray, corners: Corners) -> Corners:
-        """Reject, one by one, corners off the smooth map of the others, as where a cover took an edge.
+    def _smooth(self, positions: FloatArray, corners: Corners) -> Corners:
+        """Reject, one by one, corners off the smooth map of the others, as if a cover took an edge.
 
         The map is a homography, and a polynomial as of a lens. It may err as it does at most corners.
         """
         left = np.isfinite(corners.sigma)
         while left.sum() > 2 * _LEAST_CORNERS:
-            plane = self._grid(places, np.where(left[:, None], corners.pixels, np.nan))[0][left]
+            plane = self._grid(positions, np.where(left[:, None], corners.pixels, np.nan))[0][left]
             x, y = ((plane - plane.mean(axis=0)) / np.ptp(plane)).T
             degree, sigma = min(_DEGREE, math.isqrt(left.sum() // 4)), corners.sigma[left, None]
             terms = [x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)]
@@ -731,19 +734,19 @@ class BoardFinder(Finder):
         pixels, sigma = (np.where(left, part.T, np.nan).T for part in corners[:2])
         return Corners(pixels, sigma, corners.clean & left)
 
-    def _grid(self, places: FloatArray, guess: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _grid(self, positions: FloatArray, guess: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Corners (N, 2) of a plane grid, and steps (2, N, 2) to the next ones, px, by those seen."""
         known = np.isfinite(guess[:, 0])
-        H = self.cv.findHomography(places[known], guess[known])[0]
+        H = self.cv.findHomography(positions[known], guess[known])[0]
         if H is None:
             H = np.full((3, 3), np.nan)
         here, *there = (
-            self.cv.perspectiveTransform((places + step)[None], H)[0] for step in ((0, 0), (1, 0), (0, 1))
+            self.cv.perspectiveTransform((positions + step)[None], H)[0] for step in ((0, 0), (1, 0), (0, 1))
         )
         return here, np.stack(there) - here
 
     def like(self, tags: dict[int, Corners], before: dict[int, Corners] | None) -> dict[int, Corners]:
-        """Return the board numbered from the end that moved least since the frame before."""
+        """Return the board numbered from the end that moved by the smaller distance since the last frame."""
         if not tags or not before or not self.board.symmetric:
             return tags
         found, numberings = tags[0], board_numberings(*self.board.shape)
@@ -752,7 +755,7 @@ class BoardFinder(Finder):
         return {0: ends[int(np.argmin(far))]}
 
     def _guesses(self, grey: ByteArray) -> Iterator[FloatArray]:
-        """Corners (N, 2), px, NaN where unseen: as of OpenCV, then those of a chessboard that is covered."""
+        """Corners (N, 2), px, NaN where unseen: as of OpenCV, then corners of a covered chessboard."""
         if not self._detectors:
             size = self.board.shape[::-1]
             found, corners = self.cv.findChessboardCornersSB(grey, size, flags=self.cv.CALIB_CB_EXHAUSTIVE)
@@ -775,7 +778,7 @@ class BoardFinder(Finder):
         grids = [grid for grid in (np.rot90(seen, k) for k in range(4)) if grid.shape[:2] == self.board.shape]
 
         def lightness(grid: FloatArray) -> float:
-            """Sum of grey values of the squares alike the first, less those of the others."""
+            """Sum of grey values of the squares alike the first, less the sum of the others."""
             middles = 0.25 * (grid[1:, 1:] + grid[1:, :-1] + grid[:-1, 1:] + grid[:-1, :-1])
             known = np.isfinite(middles[..., 0])
             u, v = np.rint(middles[known]).astype(np.int64).T
@@ -788,12 +791,12 @@ class BoardFinder(Finder):
     def _part(self, grey: ByteArray) -> FloatArray:
         """Grid (r, c, 2) of the corners of a chessboard that is partly covered, px, NaN where covered.
 
-        It grows from a square. Each side of the board must show by two corners: else the numbers are not
+        It grows from a square. Each side of the board must show by two corners: otherwise the numbers are not
         known, and the grid is empty.
         """
         image, most = grey.astype(np.float64), 3 * max(self.board.shape)
-        places = np.indices((most, most))[::-1].reshape(2, -1).T.astype(np.float64)
-        even, seen = (-1.0) ** places.sum(axis=1), np.empty((0, 2))
+        positions = np.indices((most, most))[::-1].reshape(2, -1).T.astype(np.float64)
+        even, seen = (-1.0) ** positions.sum(axis=1), np.empty((0, 2))
         start = np.isin(np.arange(most**2), (most + 1) * (most // 3) + np.array([0, 1, most, most + 1]))
         for square in self._squares(image):
             if (np.linalg.norm(seen - square[0], axis=1) < _MIN_SQUARE).any():
@@ -802,7 +805,7 @@ class BoardFinder(Finder):
             pixels[start], near, usual, reach = square, start, 0.0, 1
             known = tried = np.zeros_like(start)
             while reach <= _GAP and (near is start or known.sum() >= len(square)):
-                guess, steps = self._grid(places, pixels)
+                guess, steps = self._grid(positions, pixels)
                 fitted, light = _refine_saddles(image, np.where(near[:, None], guess, np.nan), steps, np.inf)
                 usual = usual or float(np.median((light * even)[near]))
                 new = fitted.clean & (np.abs(light * even / usual - 1.0) < _UNLIKE)
@@ -814,7 +817,7 @@ class BoardFinder(Finder):
                 grown = self.cv.dilate(grown, np.ones((2 * reach + 1, 2 * reach + 1)))
                 near = grown.ravel() > tried | known
             seen = np.concatenate([seen, pixels[known]])
-            grid = self._smooth(places, Corners(pixels, sigma, known)).pixels.reshape(most, most, 2)
+            grid = self._smooth(positions, Corners(pixels, sigma, known)).pixels.reshape(most, most, 2)
             for _ in range(2):  # rows, then columns
                 lines = np.flatnonzero(np.isfinite(grid[..., 0]).sum(axis=1) > 1)
                 grid = grid[min(lines, default=0) : max(lines, default=-1) + 1].swapaxes(0, 1)
@@ -938,7 +941,7 @@ def _saddle_model(
 
 
 def finder_of(board: Board | None, dictionary: str | None) -> Finder:
-    """Detector of a board, or of tags where there is none; of the tags of ``DICTIONARY`` without a name."""
+    """Detector of a board, or of tags if there is none; of the tags of ``DICTIONARY`` without a name."""
     name = dictionary or DICTIONARY
     return TagFinder(name) if board is None else BoardFinder(board, name)
 
@@ -969,7 +972,7 @@ def dictionaries() -> dict[str, str]:
 
 
 def opencv() -> Any:
-    """Return the module of OpenCV; an InputError says what to install."""
+    """Return the module of OpenCV; an InputError names the package to install."""
     try:
         import cv2
     except ImportError as error:

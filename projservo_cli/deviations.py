@@ -1,4 +1,4 @@
-"""The one table of what can be off in an arm or a rig, for tests, joint models, monitors, files and words.
+"""The one table of possible errors of an arm or a rig, for tests, joint models, monitors, files and words.
 
 ``DEVIATIONS`` are from the model, over a recording: a calibration tests each by its tangent at the fit, and
 rows with functions of a reading can be fitted (``--joint-model``). ``CHANGES`` are since the calibration: a
@@ -9,7 +9,7 @@ mends each, are in ``words.calibrations`` and ``words.monitoring``.
 import math
 from typing import NamedTuple
 
-# What a row is of: each joint, a joint that another one reads, each camera, all cameras or all markers as one
+# Subject of a row: each joint, a joint that another one reads, each camera, all cameras or all markers as one
 # body, markers, or all images.
 JOINT, PAIR, VIEW, BODY, MARKERS, IMAGES = "joint", "pair", "view", "body", "markers", "images"
 # Units: a share, rad of a reading (prismatic × 0.3 m/rad), the rms motion of the images, s, or none.
@@ -29,7 +29,7 @@ class Deviation(NamedTuple):
     turns: bool = False  # whether it is of revolute joints alone
     range_rad: float = 0.0  # range of a joint, from which its readings show it
     cause: str = ""  # code of another row that has the same cause
-    code: str = ""  # of findings on it, where it is not the key of the row
+    code: str = ""  # code of findings on it, if it is not the key of the row
     contains: tuple[str, ...] = ()  # rows that it explains as well, with more parameters
     undone: bool = False  # whether images that it takes far are taken back before the last of a fit
 
@@ -61,7 +61,7 @@ DEVIATIONS = {
         *(JOINT, READING, 0.5 * _DEGREE),
         curve=("sine of twice", "versine of twice"),
         turns=True,
-        range_rad=math.pi,  # of less it is a cubic
+        range_rad=math.pi,  # over a smaller range it is a cubic
     ),
     "coupling": Deviation(PAIR, SHARE, 0.01, curve=("linear",)),
     "sag": Deviation(JOINT, READING, 0.5 * _DEGREE, curve=("torque",), turns=True),

@@ -32,7 +32,7 @@ class Experiment(Printed):
     Parameters
     ----------
     config : a ``Config``, the path of a YAML file, or the name of a shipped configuration.
-    path : folder of the run; None keeps all in memory, where no report can be made.
+    path : folder of the run; None keeps all in memory, if no report can be made.
     progress : called as ``progress(what, done, total)``; True for a bar in a terminal, False for none.
 
     Raises
@@ -75,7 +75,7 @@ class Experiment(Printed):
         Parameters
         ----------
         *stages : of ``calibrate``, ``plan``, ``servo`` and ``report``, in their order.
-        laws : instead of ``control.laws``: names, ``module:Class``, or what ``servo`` takes, such as
+        laws : instead of ``control.laws``: names, ``module:Class``, or values that ``servo`` takes, such as
             ``laws=["exact", MyLaw]``.
         force : whether named stages are made even if they are up to date.
         blind : whether a robot may move although cameras show no marker of the calibration.
@@ -111,7 +111,7 @@ class Experiment(Printed):
         Parameters
         ----------
         *goals : names of ``task.goals``, or of taught files ``NAME.yaml`` in the working folder.
-        law : in whose one mode the arm is driven; by default that of the configuration.
+        law : in whose one mode the arm is driven; by default the configured law.
         blind : as of ``make``.
 
         Returns
@@ -121,7 +121,7 @@ class Experiment(Printed):
         Raises
         ------
         InputError, WorkFailed
-            As of ``make``; also where a step does not converge, at which a sequence stops.
+            As of ``make``; also if a step does not converge, at which a sequence stops.
         """
         if not goals:
             raise InputError("servo: name a goal or several, such as servo('above', 'grip')")
@@ -180,11 +180,11 @@ class Experiment(Printed):
 
     @property
     def cross_validation(self) -> HeldOutErrors | None:
-        """Held-out errors of the calibration; None where they were not asked for."""
+        """Held-out errors of the calibration; None if they were not asked for."""
         return self.calibration.cross_validation
 
     def at_step(self, name: str) -> "Experiment":
-        """Return one step of a sequence as an experiment of its own, with its ``plan`` and its ``traces``.
+        """Return one step of a sequence as a separate experiment, with its ``plan`` and its ``traces``.
 
         Parameters
         ----------
@@ -193,7 +193,7 @@ class Experiment(Printed):
         Raises
         ------
         InputError
-            Where no motion of such a name was made.
+            If no motion of such a name was made.
         """
         names = [one.removeprefix("plan/") for one in self.results if one.startswith("plan/")]
         if name not in names:
@@ -254,7 +254,7 @@ def plan_scene_of(config: Config, calibration: Calibration) -> PlanScene:
 
 
 def _targets(laws: Sequence[str | Callable[[Any], Any]]) -> tuple[str, ...]:
-    """Laws each once, registered names as the classes they stand for; an InputError where there is none."""
+    """Laws each once, registered names replaced by classes; an InputError if there is none."""
     given = [laws] if isinstance(laws, str) or not np.iterable(laws) else laws
     for law in given:
         if not (isinstance(law, str) or callable(law)):
@@ -264,7 +264,7 @@ def _targets(laws: Sequence[str | Callable[[Any], Any]]) -> tuple[str, ...]:
 
 
 def law_target(name: str) -> str:
-    """The law of a name: built in, or ``module:Class``; an InputError that lists them where there is none."""
+    """The law of a name: built in, or ``module:Class``; an InputError that lists them if there is none."""
     target = name if name in CODES else plugins.target_of("law", name)
     if target is None:
         if remedy := mode_in(name):

@@ -1,4 +1,4 @@
-"""Findings: what a judgement says of a calibration, a robot, a plan or a run, as data.
+"""Findings: judgements of a calibration, a robot, a plan or a run, as data.
 
 ``projservo_cli.messages`` has the sentences.
 """
@@ -21,33 +21,33 @@ NOTE, LIMITS, REFUSES = "note", "limits", "refuses"
 
 @dataclass(frozen=True)
 class Subject:
-    """The thing that a finding is about; what does not apply is empty."""
+    """The thing that a finding is about; fields that do not apply are empty."""
 
     joints: tuple[int, ...] = ()  # numbers along the arm, from 1; of a coupling the moved one last
     views: tuple[str, ...] = ()
     markers: tuple[int, ...] = ()
     tag: int | None = None
     poses: tuple[int, ...] = ()  # numbers of the poses; of a step the one at which it begins
-    name: str = ""  # of an object, a feature, a law, a column, a file, an origin or a limit
+    name: str = ""  # name of an object, a feature, a law, a column, a file, an origin or a limit
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that is off, or limits, or refuses."""
+    """One error, limit or reason to refuse."""
 
     code: str  # a key of ``messages.ROWS``
     severity: str = NOTE
     subject: Subject = Subject()
-    amount: float = math.nan  # in ``unit``; NaN where there is none, as of the next
+    amount: float = math.nan  # in ``unit``; NaN if there is none, as of the next fields
     deviation: float = math.nan  # standard deviation of the amount
     limit: float = math.nan  # that the amount is held against
     unit: str = ""  # px, rad, m, s, or 1 for a share or a count
     effect_px: float = math.nan  # rms error of predicted images by it, per marker and view
-    period: float = math.nan  # of an error that repeats over a joint, rad or m
-    others: tuple["Finding", ...] = ()  # that the data do not tell from it, or that it consists of
+    period: float = math.nan  # period of an error that repeats over a joint, rad or m
+    others: tuple["Finding", ...] = ()  # indistinguishable by the data, or its parts
 
     def plain(self) -> dict[str, Any]:
-        """Return its fields for JSON: NaN is null, and of the subject there is what applies."""
+        """Return its fields for JSON: NaN is null, and the subject has the fields that apply."""
         values = asdict(self)
         del values["others"]
         subject = {name: value for name, value in values["subject"].items() if value not in ((), "", None)}
@@ -56,7 +56,7 @@ class Finding:
 
 
 def from_text(text: str, severity: str = LIMITS) -> Finding:
-    """Return a finding on what somebody else says in words: another version, a robot class, an error."""
+    """Return a finding with words of another source: another version, a robot class, an error."""
     return Finding("told", severity, Subject(name=text))
 
 
@@ -94,11 +94,11 @@ def of_readings(one: Finding) -> tuple[float, float]:
 
 def to_columns(findings: Iterable[Finding]) -> dict[str, Any]:
     """Return the deviations from the model as the columns of a run file, and the one that is not shown."""
-    shown = [one for one in findings if one.code in DEVIATIONS]
+    of_model = [one for one in findings if one.code in DEVIATIONS]
     hidden = [other for one in findings if one.code == "unshown" for other in one.others]
     return {
-        "model_error": tuple(_word(one) for one in shown),
-        "model_error_numbers": np.array([_numbers(one) for one in shown]) if shown else None,
+        "model_error": tuple(_word(one) for one in of_model),
+        "model_error_numbers": np.array([_numbers(one) for one in of_model]) if of_model else None,
         "unshown_error": tuple(_word(one) for one in hidden),
         "unshown_numbers": np.array(_numbers(hidden[0])) if hidden else None,
     }
@@ -125,7 +125,7 @@ def from_columns(name: str, numbers: Iterable[float], units: Sequence[str]) -> F
 
 
 def _parsed(word: str, units: Sequence[str]) -> Finding:
-    """Return a finding on what ``named`` wrote."""
+    """Return a finding from the output of ``named``."""
     code, joints, view = word.split("|")
     which = tuple(int(joint) for joint in joints.split(",") if joint)
     subject, unit = Subject(joints=which, views=(view,) if view else ()), DEVIATIONS[code].unit

@@ -15,7 +15,7 @@ import numpy as np
 from projservo_cli.records import VIEWS, BoolArray, FloatArray, InputError
 
 BEHIND = -1e9
-"""Distance, px, from the border of an image of what no camera shows."""
+"""Distance, px, from the border of an image of an unseen point."""
 FACTORS = (0.25, 1.0 / 3.0, 0.5, 2.0 / 3.0, 0.75, 0.8, 1.25, 4.0 / 3.0, 1.5, 2.0, 3.0, 4.0)
 """Ratios of the sizes that cameras have."""
 ImageSize = tuple[int, int] | tuple[tuple[int, int], ...] | Mapping[str, tuple[int, int]]
@@ -23,9 +23,9 @@ ImageSize = tuple[int, int] | tuple[tuple[int, int], ...] | Mapping[str, tuple[i
 
 
 def image_sizes(size: Any, view: Sequence[str]) -> FloatArray:
-    """Width and height (V, 2) of each image, px, by those of all views or of one each; infinite for None.
+    """Width and height (V, 2) of each image, px, from one size or one per view; infinite for None.
 
-    Raises InputError for sizes of other views than those of the names.
+    Raises InputError for sizes of unnamed views.
     """
     if isinstance(size, Mapping):
         if {*size} != {*view}:
@@ -37,7 +37,7 @@ def image_sizes(size: Any, view: Sequence[str]) -> FloatArray:
     sizes = np.array(math.inf if size is None else size, dtype=np.float64)
     if sizes.ndim == 2 and len(sizes) != len(view):
         raise InputError(
-            f"{len(sizes)} image sizes for the views {', '.join(view)}: give one, or one a view in this order"
+            f"{len(sizes)} image sizes for the views {', '.join(view)}: give one, or one per view, in order"
         )
     return np.broadcast_to(sizes, (len(view), 2)).copy()
 

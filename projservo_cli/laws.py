@@ -14,7 +14,7 @@ REGULATE = "regulate"
 TRACK = "track"
 IMAGE_TRACK = "image_track"
 INCIDENCES = "incidences"
-# What a law does in each of its modes.
+# Behaviour of a law in each of its modes.
 MODES = {
     REGULATE: "regulates to the goal in each step",
     TRACK: "follows the joints of the plan, and corrects them by images",
@@ -38,7 +38,7 @@ class _LawSpec(NamedTuple):
     family: Family
     modes: tuple[str, ...]  # it follows a plan in all but ``REGULATE``
     velocity: str  # that it asks of the joints, in Markdown
-    source: str  # in Markdown
+    source: str  # reference, in Markdown
     metric: bool = False  # is given the metric model
     paper: bool = True  # is one of [RH00]
 
@@ -129,7 +129,7 @@ def fault_fails(law: str) -> bool:
 
 
 def run_name(law: str, mode: str) -> str:
-    """Return the name of the run of a law in a mode: ``exact`` where it replans, else ``exact_track``."""
+    """Return the name of the run of a law in a mode: ``exact`` if it replans, otherwise ``exact_track``."""
     return law if mode == REGULATE else f"{law}_{mode}"
 
 
@@ -144,7 +144,7 @@ def codes_of(names: Iterable[str]) -> set[int]:
 
 
 def mode_in(name: str) -> str:
-    """Tell, where a name given as a law is that of a run in another mode, what to set instead; else empty."""
+    """Say which setting to use if a given law is the name of a run in another mode; otherwise empty."""
     law, mode = law_and_mode(name)
     if mode == REGULATE:
         return ""
@@ -152,7 +152,7 @@ def mode_in(name: str) -> str:
 
 
 def run_names(laws: Sequence[str], modes: Sequence[str]) -> tuple[str, ...]:
-    """Names of the runs of laws, each in those of the modes that it has.
+    """Names of the runs of laws, each in the modes that it has.
 
     Raises InputError if a law has none of them.
     """

@@ -45,7 +45,7 @@ class Observations(Displayable, Observation):
     exact : whether pixel noise is their only error, so that χ² decides against ``noise_px``.
     seed : seed of the random starts of a calibration.
     mount : ``world`` for cameras that watch the tool, ``tool`` for cameras on it.
-    order_stated : whether the order of the joints along the arm is known to be that of q.
+    order_stated : whether the order of the joints along the arm is known to be the order of q.
     """
 
     joint_types: str = ""
@@ -164,7 +164,7 @@ class Observations(Displayable, Observation):
         joint_types : one letter a joint column, R or P; by default all R.
         joint_unit : ``deg`` or ``rad`` of the revolute columns; by default rad.
         image_size : width and height, px, of both images or of one each; by default the extent of the pixels.
-        noise_px : standard deviation of a coordinate, px; by default that of the table, else estimated.
+        noise_px : standard deviation of a coordinate, px; by default as in the table, otherwise estimated.
 
         Raises
         ------
@@ -188,7 +188,7 @@ class Observations(Displayable, Observation):
         Parameters
         ----------
         parts : observations by the same cameras, as in ``Observations.concat([trials, more])``. Markers that
-            one lacks are unseen there; the seed is that of the first.
+            one lacks are unseen there; the first gives the seed.
 
         Raises
         ------
@@ -277,14 +277,14 @@ class Observations(Displayable, Observation):
 
 
 def _types_of(joint_types: str | Sequence[str] | None, n: int | None = None) -> str | None:
-    """Letters of the types of joints, of which there are n where that is known; None where none are given."""
+    """Letters of the types of joints, of which there are n if that is known; None if none are given."""
     if joint_types is None:
         return None
     letters = [*joint_types] if np.iterable(joint_types) else [joint_types]
     types = "".join(map(str, letters)).upper()
     if set(types) - {"R", "P"} or len(types) != (len(types) if n is None else n):
         some = "letters" if n is None else f"{n} letters"
-        raise InputError(f"joint_types: {joint_types!r}: expected {some} R or P, one a joint")
+        raise InputError(f"joint_types: {joint_types!r}: expected {some} R or P, one per joint")
     return types
 
 
@@ -308,7 +308,7 @@ def _text_of(table: Any) -> str:
 
 
 def _unmasked(values: Any) -> npt.NDArray[Any]:
-    """A column, NaN where it is masked."""
+    """A column, NaN if it is masked."""
     return numbers_in("table", values, "(rows,)") if np.ma.is_masked(values) else np.asarray(values)
 
 

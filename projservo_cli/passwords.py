@@ -1,10 +1,10 @@
-"""Masks of passwords and tokens in what is shown or stored."""
+"""Masks of passwords and tokens in displayed or stored texts."""
 
 import re
 from typing import Any
 
 MASK = "***"
-"""Stands for a password in what is shown or stored."""
+"""Replaces a password in displayed or stored texts."""
 # Passwords of URLs (RFC 3986, section 3.2.1), which users write with slashes and @ too, unlike ports; and
 # values of parameters.
 _USERINFO = re.compile(r"://(?:([^\s/?#:@]*:)(?!\d*(?:[/?#\s]|$))\S*|[^\s/?#:@]*)@")

@@ -15,11 +15,11 @@ _INSTALLED = tuple({sysconfig.get_path(name) for name in ("stdlib", "platstdlib"
 def source_hash(target: str) -> str:
     """Return a hash of the module of a class and of all modules of its author that it imports.
 
-    Modules of the author are those of the same package, and those that were not installed. They are found by
+    Modules of the author are in the same package, or were not installed. They are found by
     the import statements of each; one that is imported by a name made at run time is not.
 
     target : ``module:Class``.
-    The hash is empty where the module is not found, or has no source.
+    The hash is empty if the module is not found, or has no source.
     """
     module = target.split(":")[0]
     top = module.split(".")[0]
@@ -56,7 +56,7 @@ def _specs(module: str) -> Iterator[ModuleSpec]:
 
 
 def _source(spec: ModuleSpec, top: str) -> bytes | None:
-    """Source of a module of the author whose package is ``top``; None where it is of another or has none."""
+    """Source of a module of the author whose package is ``top``; None if it is of another or has none."""
     if not spec.has_location or not (spec.origin or "").endswith(".py"):
         return None
     file = Path(spec.origin or "")

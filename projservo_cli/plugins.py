@@ -30,7 +30,7 @@ TARGET = rf"^{_DOTTED}:{_DOTTED}$"
 
 
 def registered_names(kind: str) -> dict[str, str]:
-    """Names of a ``plant`` or ``law``, projservo's own and those of installed packages, with the classes."""
+    """Names of a ``plant`` or ``law``, projservo's own and from installed packages, with the classes."""
     found = {point.name: point.value for point in metadata.entry_points(group=_GROUPS[kind])}
     return found | (_OWN_PLANTS if kind == "plant" else {})
 
@@ -41,7 +41,7 @@ def short_name(target: str) -> str:
 
 
 def target_of(kind: str, name: str) -> str | None:
-    """The class ``module:Class`` that a name stands for; None where it stands for none."""
+    """The class ``module:Class`` of a name; None if it has none."""
     return name if re.match(TARGET, name) else registered_names(kind).get(name)
 
 
@@ -96,7 +96,7 @@ def takes(target: str, name: str) -> bool:
     """Tell whether the class of a robot names an argument that it takes; one that takes any names none."""
     try:
         return name in inspect.signature(find("plant", target)).parameters
-    except ValueError:  # of a class in C
+    except ValueError:  # a class in C
         return False
 
 
@@ -106,7 +106,7 @@ _BROUGHT: dict[str, Any] = {}  # classes of this process, by name
 def _found(where: str, module: str, name: str) -> Any:
     if f"{module}:{name}" in _BROUGHT:
         return _BROUGHT[f"{module}:{name}"]
-    if os.getcwd() not in sys.path:  # last, so that a file there never stands in for an installed module
+    if os.getcwd() not in sys.path:  # last, so that a file there never replaces an installed module
         sys.path.append(os.getcwd())
     try:
         found: Any = importlib.import_module(module)
@@ -143,14 +143,14 @@ def class_name(given: Any) -> str:
 def bring(kind: str, given: Any) -> str:
     """Make a class, or a function, that this process has be found by its name, which is returned."""
     target = class_name(given)
-    if isinstance(given, type):  # what a function makes is checked when it has made it
+    if isinstance(given, type):  # the result of a function is checked later
         require_object(kind, target, given)
     _BROUGHT[target] = given
     return target
 
 
 def importable(given: Any) -> bool:
-    """Whether another process finds a class by its name, unlike those of a notebook or a function."""
+    """Whether another process finds a class by its name, unlike classes of a notebook or a function."""
     module, path = sys.modules.get(given.__module__), given.__qualname__.split(".")
     found: Any = module if getattr(module, "__file__", None) is not None else None
     for step in path:
@@ -206,7 +206,7 @@ def require_spelt(where: str, found: Any, names: Sequence[str]) -> None:
 
 
 def what_failed(error: BaseException) -> str:
-    """An exception of somebody else's code in one line, with the place that raised it."""
+    """An exception of external code in one line, with the place that raised it."""
     frames = traceback.extract_tb(error.__traceback__)
     place = f" ({Path(frames[-1].filename).name}:{frames[-1].lineno})" if frames else ""
     if isinstance(error, SyntaxError) and error.filename:

@@ -25,7 +25,7 @@ ByteArray = npt.NDArray[np.uint8]
 
 VIEWS = ("left", "right")
 # Name of a view, as in the columns u_NAME, v_NAME, in small letters of any language, and of one word or more;
-# q alone is that of joint readings: t_q is their time.
+# q alone belongs to joint readings: t_q is their time.
 VIEW_NAME = r"(?!q$)[^\W_](?: ?\w)*"
 WORLD, TOOL = "world", "tool"  # where the cameras are mounted: the markers are on the other
 MM = 1e3  # mm in a metre
@@ -34,8 +34,8 @@ FARTHEST_M = 20.0  # no prismatic joint that two cameras watch goes farther
 # Features of an incidence, by the number of points that span one, and how two of them are to lie.
 KINDS = ("point", "line", "plane")
 MEET, PARALLEL, PERPENDICULAR, ANGLE = "meet", "parallel", "perpendicular", "angle"
-CORNERS = 4  # of a tag: corner k of tag t is marker 4 t + k
-# Reasons of rejected markers: a marker stands still in the images, is of another body, slips, or hardly any
+CORNERS = 4  # corners of a tag: corner k of tag t is marker 4 t + k
+# Reasons of rejected markers: a marker is fixed in the images, on another body, slips, or hardly any
 # of its readings fits.
 WHY_LOST = ("still", "other body", "drifting", "hardly seen")
 
@@ -84,17 +84,17 @@ def _scalar(units: str = "1", about: str = "", **default: Any) -> Any:
 
 
 def _optional_array(dims: str, units: str = "1", about: str = "") -> Any:
-    """Declare an array field that is None where there is none."""
+    """Declare an array field that is None if there is none."""
     return _array(dims, units, about, default=None)
 
 
 def _optional_scalar(units: str = "1", about: str = "") -> Any:
-    """Declare a scalar or text field that is None where there is none."""
+    """Declare a scalar or text field that is None if there is none."""
     return _scalar(units, about, default=None)
 
 
 def _by_view(about: str, **default: Any) -> Any:
-    """Declare a tuple of numbers, one a view; files and JSON have each by its name and that of its view."""
+    """Declare a tuple of numbers, one per view; files and JSON name each by field and view."""
     return field(metadata={"units": "1", "about": about, "by_view": True}, **default)
 
 
@@ -102,12 +102,12 @@ _Found = TypeVar("_Found")
 
 
 def _kept(function: Callable[[Any], _Found]) -> Callable[[Any], _Found]:
-    """Keep what a function finds of each class, which mypy takes for unhashable."""
+    """Cache the result of a function of a class, which mypy takes for unhashable."""
     return cache(function)
 
 
 class RecordPart:
-    """Base of a part of a record, whose fields stand among those of the record in files and JSON."""
+    """Base of a part of a record, whose fields are among the fields of the record in files and JSON."""
 
 
 def part_of(entry: "Field[Any]") -> type[RecordPart] | None:
@@ -117,12 +117,12 @@ def part_of(entry: "Field[Any]") -> type[RecordPart] | None:
 
 
 def is_optional(entry: "Field[Any]") -> bool:
-    """Tell whether a field is None where there is none."""
+    """Tell whether a field is None if there is none."""
     return type(None) in get_args(entry.type)
 
 
 def is_list(entry: "Field[Any]") -> bool:
-    """Tell whether a field holds any number of parts, of which the first stands among those of the record."""
+    """Tell whether a field holds a list of parts, the first of which is among the fields of the record."""
     return part_of(entry) is not None and get_origin(entry.type) is tuple
 
 
@@ -133,7 +133,7 @@ def has_default(entry: "Field[Any]") -> bool:
 
 @_kept
 def flat_fields(kind: Any) -> tuple["Field[Any]", ...]:
-    """Fields of a kind of record as files have them: those of each part in its place."""
+    """Fields of a kind of record as files have them: with the fields of each part in its place."""
     found: list[Field[Any]] = []
     for entry in fields(kind):
         part = part_of(entry)
@@ -149,8 +149,8 @@ def optional_names(kind: Any) -> frozenset[str]:
 
 
 @_kept
-def _places(kind: Any) -> dict[str, str]:
-    """Names that parts of a kind of record have, each with that of the field that holds the part."""
+def _parts_of(kind: Any) -> dict[str, str]:
+    """Names that parts of a kind of record have, each with the name of the field that holds the part."""
     found: dict[str, str] = {}
     for entry in fields(kind):
         if (part := part_of(entry)) is not None:
@@ -160,11 +160,11 @@ def _places(kind: Any) -> dict[str, str]:
 
 
 class Composite:
-    """Base of a record of parts: what these have are attributes of the record, too."""
+    """Base of a record of parts: their attributes are attributes of the record, too."""
 
     def __getattr__(self, name: str) -> Any:
-        """Attribute of a part, of a list of the first; its default where it is absent."""
-        place = _places(type(self)).get(name)
+        """Attribute of a part, of a list of the first; its default if it is absent."""
+        place = _parts_of(type(self)).get(name)
         if place is None:
             raise AttributeError(f"{type(self).__name__} has no {name}")
         part = getattr(self, place)
@@ -177,7 +177,7 @@ class Composite:
         return None if default is MISSING else default
 
     def __dir__(self) -> Iterable[str]:
-        return sorted({*super().__dir__(), *_places(type(self))})
+        return sorted({*super().__dir__(), *_parts_of(type(self))})
 
 
 _Record = TypeVar("_Record")
@@ -204,20 +204,20 @@ def composed(kind: Any, values: Mapping[str, Any]) -> Any:
 
 
 def changed(record: _Record, **values: Any) -> _Record:
-    """Return a record with other values of some fields, its own or those of the parts that it has.
+    """Return a record with other values of some fields, its own or of its parts.
 
     Of a list of parts the first is meant.
     """
     own: dict[str, Any] = {}
     of_parts: dict[str, dict[str, Any]] = {}
     for name, value in values.items():
-        place = _places(type(record)).get(name)
+        place = _parts_of(type(record)).get(name)
         (own if place is None else of_parts.setdefault(place, {}))[name] = value
     for place, inner in of_parts.items():
-        held = getattr(record, place)
-        first, *others = held if isinstance(held, tuple) else (held,)
+        part_or_parts = getattr(record, place)
+        first, *others = part_or_parts if isinstance(part_or_parts, tuple) else (part_or_parts,)
         part = replace(first, **inner)
-        own[place] = (part, *others) if isinstance(held, tuple) else part
+        own[place] = (part, *others) if isinstance(part_or_parts, tuple) else part
     return replace(record, **own)  # type: ignore[type-var]  # records are dataclasses
 
 
@@ -310,7 +310,7 @@ class JointCurve(NamedTuple):
     arm: FloatArray
 
 
-FROM_ONE = np.array([0.0, 1.0, 1.0, 0.0])  # adds to terms what numbers joints from 1
+FROM_ONE = np.array([0.0, 1.0, 1.0, 0.0])  # added to terms, numbers joints from 1
 NO_CURVE = JointCurve(np.zeros((0, 4)), np.zeros((0, 5, 4)))
 
 
@@ -318,14 +318,14 @@ class Model(NamedTuple):
     """Robot and rig as the kernels see them, in one frame, projective or metric.
 
     The calibrated model lives in a projective frame; the true one in the metric frame of the robot
-    base, where the operators are 4×4 twists and ``a_inf`` is (0, 0, 0, 1).
+    base, if the operators are 4×4 twists and ``a_inf`` is (0, 0, 0, 1).
     """
 
     P: FloatArray  # (V, 3, 4) cameras to pixels
     # (n, 4, 4) joint operators at the reference, one unit of motion per rad or m; of cameras on the tool they
     # move the scene before them, in the order of the arm
     H_hat_0: FloatArray
-    prismatic: BoolArray  # (n,) whether a joint is prismatic; it is revolute else
+    prismatic: BoolArray  # (n,) whether a joint is prismatic; otherwise it is revolute
     q_reference: FloatArray  # (n,) joint reading at the reference, rad or m
     a_inf: FloatArray  # (4,) plane at infinity, the common left null vector of the operators
     # (V, 5) radial distortion of the views: image centre u, v and radius, px, then k1, k2
@@ -345,7 +345,7 @@ class Spread(NamedTuple):
     H_hat: FloatArray  # (k, n, 4, 4)
     M: FloatArray  # P, H_hat, M: (k, b, 4) cameras, operators, markers; first as calibrated
     rest: float  # standard deviation that is left to all other directions, px
-    most: float  # largest standard deviation of a coordinate that was met with, px
+    max_sigma: float  # largest standard deviation of a coordinate that was met with, px
 
 
 class Errors(NamedTuple):
@@ -354,7 +354,7 @@ class Errors(NamedTuple):
     Their covariance is Λ Λᵀ + diag(own ownᵀ), with Λ of ``shared`` over ``marker``: linear in the markers.
     """
 
-    shared: FloatArray  # (s, r) of parameters before those of the markers
+    shared: FloatArray  # (s, r) of the parameters before the markers
     marker: FloatArray  # (m, d, r) of the d parameters of each marker, by the same errors
     own: FloatArray  # (m, d, 3) and by its separate ones
 
@@ -363,7 +363,7 @@ class Errors(NamedTuple):
         return Errors(self.shared, self.marker[markers], self.own[markers])
 
     def scaled(self, factor: float) -> "Errors":
-        """So many times as large."""
+        """Errors times a factor."""
         return Errors(factor * self.shared, factor * self.marker, factor * self.own)
 
     def dense(self) -> FloatArray:
@@ -375,7 +375,7 @@ class Errors(NamedTuple):
 
 
 def apart(common: FloatArray, own: FloatArray, marker: IntArray, m: int) -> FloatArray:
-    """Changes (…, r) by errors that all feel and (…, 3) by those of a marker (…) of m, as (…, r + 3 m)."""
+    """Changes (…, r) by errors that all feel and (…, 3) by errors of a marker (…) of m, as (…, r + 3 m)."""
     *shape, r = common.shape
     result = np.zeros((*shape, r + 3 * m))
     result[..., :r] = common
@@ -385,7 +385,7 @@ def apart(common: FloatArray, own: FloatArray, marker: IntArray, m: int) -> Floa
 
 
 NO_SPREAD = Spread(
-    P=np.zeros((0, 2, 3, 4)), H_hat=np.zeros((0, 0, 4, 4)), M=np.zeros((0, 0, 4)), rest=0.0, most=0.0
+    P=np.zeros((0, 2, 3, 4)), H_hat=np.zeros((0, 0, 4, 4)), M=np.zeros((0, 0, 4)), rest=0.0, max_sigma=0.0
 )
 
 
@@ -444,9 +444,7 @@ class Observation:
 class CalibratedRig(RecordPart):
     """Cameras in the projective frame."""
 
-    mount: str = _scalar(
-        about="world: cameras stand still and watch the tool; tool: the reverse", default=WORLD
-    )
+    mount: str = _scalar(about="world: fixed cameras watch the tool; tool: the reverse", default=WORLD)
     P: FloatArray = _array("view image_row coordinate", "px", "cameras, projective frame")
     lens: FloatArray | None = _optional_array(
         "view lens_term", about="radial distortion, if estimated: image centre u, v and radius in px, k1, k2"
@@ -484,7 +482,7 @@ class CalibratedArm(RecordPart):
 
     @property
     def curve(self) -> JointCurve | None:
-        """True joints by readings, in the order of the arm; None where they are equal."""
+        """True joints by readings, in the order of the arm; None if they are equal."""
         if self.joint_curve is None:
             return None
         terms = self.joint_curve[:, :4] - FROM_ONE
@@ -528,7 +526,7 @@ class ParameterErrors(RecordPart):
 
     @property
     def has_covariance(self) -> bool:
-        """Whether it says how far it is off; that of a truth, which is not off, does not."""
+        """Whether it states its errors; a truth, which is exact, does not."""
         return bool(np.isfinite(self.sqrt_cov_shared).all())
 
 
@@ -615,7 +613,7 @@ class Rejections(RecordPart):
         "turned_row turned_column",
         about="images of a board, numbered from another end and turned right: pose, index of the view",
     )
-    placeholders: int = _scalar(about="number of detections that stood for unseen markers", default=0)
+    placeholders: int = _scalar(about="number of detections in place of unseen markers", default=0)
     unseen_poses: IntArray | None = _optional_array("unseen_pose", about="poses that no camera saw")
     circular_joints: IntArray | None = _optional_array(
         "circular_joint", about="joints, from 1, whose readings passed a full turn"
@@ -670,7 +668,7 @@ class StatedErrors(RecordPart):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TimeOffset(RecordPart):
-    """Time of joint readings less that of images, if poses in motion determine it."""
+    """Time of joint readings minus the time of images, if poses in motion determine it."""
 
     time_offset_s: FloatArray = _array("view", "s", "time of a joint reading less the time of its image")
     time_offset_interval_s: FloatArray = _array("view limit", "s", "95 % interval of the time offset")
@@ -695,15 +693,15 @@ class Refits(RecordPart):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CalibrationVerdict(RecordPart):
-    """Whether a calibration is usable, and what limits it."""
+    """Whether a calibration is usable, and its limits."""
 
     usable: bool = _scalar(about="whether the calibration is usable for control")
     reason: str = _scalar(about="reason why it is usable or not")
     advice: tuple[str, ...] = _scalar(about="remedies, one sentence each")
     limit: str = _scalar(about="factor that limits the predictions", default="")
-    notes: tuple[str, ...] = _scalar(about="those of the remedies that mend nothing but noise", default=())
+    notes: tuple[str, ...] = _scalar(about="remedies that only reduce noise", default=())
     findings: tuple[Finding, ...] = _scalar(
-        about="what is off: code, severity, subject, amount, deviation, limit, unit, effect",
+        about="findings: code, severity, subject, amount, deviation, limit, unit, effect",
         default=(),
     )
 
@@ -766,7 +764,7 @@ class Calibration(Composite):
         ) // len(self.rig.P)
 
     def without_covariance(self) -> "Calibration":
-        """The same, which takes little memory, for those who do not ask how far it is off."""
+        """The same, which takes little memory, for callers who need no errors of it."""
         none = {
             name: getattr(self, name)[..., :0]
             for name in ("sqrt_cov_shared", "sqrt_cov_marker", "sqrt_cov_own")
@@ -971,7 +969,7 @@ class JointSpaceSearch(RecordPart):
 class CarriedByObject(RecordPart):
     """Object that the goal was taught on, where it is now, and the goal carried along.
 
-    A goal may have several: files have the first among the fields of the plan, others in groups of their own.
+    A goal may have several: files have the first among the fields of the plan, others in separate groups.
     """
 
     object_name: str = _scalar(about="name of the object that carries the goal")
@@ -991,7 +989,7 @@ class CarriedByObject(RecordPart):
     goal_deviation_px: float = _scalar("px", "deviation of its images, rms per marker and view")
     object_marker: IntArray = _array("object_marker", about="numbers of the markers of the object")
     object_left_out: str | None = _optional_scalar(
-        about="numbers of its markers that were off by themselves in a look, and left out of it"
+        about="numbers of its markers that disagreed in one observation of the object, and were left out"
     )
     s_object: FloatArray = _array(
         "view object_marker xy", "px", "images of these when it was planned, NaN if unseen"
@@ -1034,7 +1032,7 @@ class CarriedByObject(RecordPart):
         return (
             f"{self.object_name} has moved by {' and '.join(shift[:-1]) or shift[-1]} since the goal was "
             f"taught; the goal is known to {', '.join(known[:-1]) or known[-1]}"
-            + (f"; off by itself and left out: marker {self.object_left_out}" if self.object_left_out else "")
+            + (f"; inconsistent and left out: marker {self.object_left_out}" if self.object_left_out else "")
         )
 
 
@@ -1060,7 +1058,7 @@ class Plan(Composite):
     """A reaching task as a translation and two rotations, and the motion planned for it.
 
     Everything comes from the calibration and the start and goal images. Amplitudes are per view
-    where they concern visibility: None is stored as NaN where a motion never changes it.
+    if they concern visibility: None is stored as NaN if a motion never changes it.
     """
 
     view: tuple[str, ...] = _scalar(about="names of the views", default=VIEWS)
@@ -1071,7 +1069,7 @@ class Plan(Composite):
     )
     reason: str = _scalar(about="reason why the plan is feasible or not")
     findings: tuple[Finding, ...] = _scalar(
-        about="what holds or is off: code, severity, subject, amount, deviation, limit, unit, effect",
+        about="findings: code, severity, subject, amount, deviation, limit, unit, effect",
         default=(),
     )
     constraint: str = _scalar(
@@ -1114,12 +1112,12 @@ class RunErrors(RecordPart):
     estimated_position_error_mm: float | None = _optional_scalar(
         "mm",
         "estimated distance of the face from the goal, rms: by the images, with undetected_position_error_mm "
-        "and what goal images leave open; none if no length on the face is known, or images disagree with "
+        "and the uncertainty of goal images; none if no length on the face is known, or images disagree with "
         "the calibration",
     )
     undetected_position_error_mm: float | None = _optional_scalar(
         "mm",
-        "part of it: by what no test tells from none, at two deviations, such as tags that moved less than "
+        "part of it: by errors that no test detects, at two deviations, such as tags that moved less than "
         "backlash hides; none if images are not tested",
     )
 
@@ -1207,7 +1205,7 @@ class TrueMotion(RecordPart):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class IncidenceHistory(RecordPart):
-    """Incidences that were to hold at the goal of a run, and how far they were off."""
+    """Incidences that were to hold at the goal of a run, and their errors."""
 
     incidences: tuple[str, ...] = _scalar(
         about="incidences that were to hold at the goal; none for the whole pose", default=()
@@ -1227,7 +1225,7 @@ class IncidenceHistory(RecordPart):
         "one, two or three of a point, line or plane",
     )
     feature_s_star: FloatArray = _array(
-        "incidence span view xy", "px", "images of those of the scene, where they were taught"
+        "incidence span view xy", "px", "images of the features of the scene, as taught"
     )
     incidence_mm: FloatArray = _array(
         "incidence",
@@ -1238,7 +1236,7 @@ class IncidenceHistory(RecordPart):
     incidence_deg: FloatArray = _array(
         "incidence",
         "deg",
-        "angle that an incidence is off at the end, as stated likewise; NaN of points, or where the joints "
+        "angle error of an incidence at the end, as stated likewise; NaN of points, or if the joints "
         "leave angles open",
     )
     free_motion: FloatArray | None = _optional_array(
@@ -1308,7 +1306,7 @@ class Trace(Composite):
     frames: RecordedFrames | None = None
 
     def __getattr__(self, name: str) -> Any:
-        """What a part has by a name, or the number of one view, such as ``self_occluded_steps_left``."""
+        """Attribute of a part by name, or the number of one view, such as ``self_occluded_steps_left``."""
         if name.startswith("self_occluded_steps_"):  # names of views are not known before a run
             numbers = scalars_of(self)
             if name in numbers:
@@ -1330,7 +1328,7 @@ class Report:
     """Files of a report, the claims of the paper against the runs, and the numbers of the extra runs.
 
     Laws are direct_three and direct_two, operators true and calibrated, limits none and the limit
-    per step. Deviations are NaN where the goal pose is unknown.
+    per step. Deviations are NaN if the goal pose is unknown.
     """
 
     figures: tuple[str, ...] = _scalar(about="files written, relative to the folder of the run")
@@ -1364,7 +1362,7 @@ class Report:
 class JointList:
     """Joint readings of numbered poses."""
 
-    pose: IntArray  # (K,) numbers; 0, 1 … where the file has none
+    pose: IntArray  # (K,) numbers; 0, 1 … if the file has none
     q: FloatArray  # (K, n) readings, rad or m
     numbered: bool  # whether the file has pose numbers
     images: dict[str, tuple[str, ...]] | None = None  # of each view, the names of its images at each pose

@@ -1,7 +1,7 @@
 """Keys of results: hashes of the canonical bytes of the records that stages read.
 
 Equal values have equal bytes, so that the inputs of a stage alone decide whether its result is outdated.
-Files stand in them by their content.
+They contain files by their content.
 """
 
 import dataclasses
@@ -16,7 +16,7 @@ import numpy as np
 from projservo_cli.passwords import masked
 from projservo_cli.records import InputError
 
-# Types whose records are keyed by the module in which they stood first: one that moves keeps its name here,
+# Types whose records are keyed by their first module: one that moves keeps its name here,
 # so that results of users stay valid. Other types are keyed by their own names, each of which must be unique.
 _FIRST_MODULES = {
     "control.law": "Gains",
@@ -62,13 +62,13 @@ class File(NamedTuple):
     """A file that a stage reads, which may lie anywhere."""
 
     path: str
-    sha256: str  # of its content
+    sha256: str  # hash of its content
 
     @classmethod
     def of(cls, path: str, expected: str, gone: str = "", further: Sequence[str] = ()) -> "File":
         """Return the file at a path; InputError with the ``expected`` file if it cannot be read.
 
-        gone : hash that it had, which stands where there is no such file any more.
+        gone : hash that it had, which holds if there is no such file any more.
         further : files that it names, whose content counts too.
         """
         if gone and not Path(path).exists():

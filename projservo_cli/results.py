@@ -55,11 +55,11 @@ from projservo_cli.task.object_bundle_adjustment import ObjectView
 
 _AT_ONCE = 100  # poses whose derivatives are worked out together: more of them leave the cache
 _MAX_BYTES = 10_000_000  # maximum size of a URDF
-_AT_INFINITY = 1e-12  # of the norms: what rounding leaves of a_inf @ A there
+_AT_INFINITY = 1e-12  # share of the norms that rounding leaves of a_inf @ A there
 
 
 def _axes_of(ax: Any) -> Any:
-    """Return axes to draw into. Raises InputError for anything else, such as the array of ``subplots``."""
+    """Return axes to draw into. Raises InputError for other values, such as the array of ``subplots``."""
     from matplotlib.axes import Axes
 
     if not isinstance(ax, Axes):
@@ -102,11 +102,11 @@ class WrittenReport(Displayable, Report):
 
     def summary(self) -> dict[str, str]:
         """Return a summary in words, by name."""
-        held = [claim["holds"] for claim in self.claims]
+        judged = [claim["holds"] for claim in self.claims]
         found = {"figures": f"{len(self.figures)} files", "omitted": f"{len(self.omitted)}"}
-        if held:
+        if judged:
             found["claims"] = (
-                f"{held.count(True)} hold, {held.count(False)} do not, {held.count(None)} not judged"
+                f"{judged.count(True)} hold, {judged.count(False)} do not, {judged.count(None)} not judged"
             )
         failing = [claim["claim"] for claim in self.claims if claim["holds"] is False]
         return found | ({"do not hold": ", ".join(failing)} if failing else {})
@@ -120,8 +120,8 @@ class ImageModel(Displayable, Calibration):
     readings rad or m. A point that is not in front of a camera has no pixels there: NaN.
     """
 
-    cross_validation: HeldOutErrors | None = None  # held-out errors, where they were asked for
-    observation: Observation | None = None  # of the calibration, if at hand
+    cross_validation: HeldOutErrors | None = None  # held-out errors, if they were asked for
+    observation: Observation | None = None  # observation of the calibration, if at hand
 
     @classmethod
     def of(
@@ -227,7 +227,7 @@ class ImageModel(Displayable, Calibration):
         None without a pair; ``stated_px``, the median error that the covariance states there, ``noise_px`` of
         these images, and ``limit_px``, three times both together, above which the median contradicts the
         calibration; ``views``, with the ``view``, ``count``, ``median_px`` and ``limit_px`` of each, which
-        show a camera that moved; ``skipped`` by why; ``findings``, one that refuses where a limit is passed.
+        show a camera that moved; ``skipped`` by why; ``findings``, one that refuses if a limit is passed.
 
         Raises
         ------
@@ -295,7 +295,7 @@ class ImageModel(Displayable, Calibration):
     def residuals(self) -> Any:
         """Return the residuals of the calibration as a pandas table, a row for each marker seen in a view.
 
-        Columns are ``pose``, ``marker``, ``view``, the pixels ``u`` and ``v``, what they are off the
+        Columns are ``pose``, ``marker``, ``view``, the pixels ``u`` and ``v``, their differences from the
         prediction, ``du`` and ``dv`` in px, and ``used``, whether the fit took them.
 
         Raises
@@ -398,7 +398,7 @@ class ImageModel(Displayable, Calibration):
     ) -> DisplacedObject:
         """Find where an object of the scene lies by looks at it, to carry goals that were taught on it along.
 
-        Its displacement is rigid in the metric that the joints preserve, else affine. Looks in between
+        Its displacement is rigid in the metric that the joints preserve, otherwise affine. Looks in between
         refine its shape.
 
         Parameters
@@ -406,7 +406,7 @@ class ImageModel(Displayable, Calibration):
         marker : (k,) numbers of the markers of the object, as messages name them.
         looks : two or more, each (V, k, 2) px, NaN where unseen: the first when the goal was taught, the last
             now.
-        metric : what ``metric`` gave, for mm.
+        metric : result of ``metric``, for mm.
 
         Returns
         -------
@@ -465,14 +465,14 @@ class MetricModel(Printed, Metric):
     The base frame has z along joint 1 and x along z × the direction of the first joint that is not parallel
     to it, at readings of zero; its origin is on the first revolute axis, at its common normal with the first
     revolute one that is not parallel. The tool frame has its origin at the mean of the face, x from its first
-    marker to its second, and z across them and the next that is off their line. The flange frame of cameras
-    on the tool is that of the base, from the last joint back. ``in_frames_of`` takes those of a model
-    instead. Covariances are those of the calibration, to first order, with those of frames and of
-    the known length.
+    marker to its second, and z across them and the next that is not on their line. The flange frame of
+    cameras on the tool is the frame of the base, from the last joint back. ``in_frames_of`` takes the frames
+    of a model instead. Covariances follow from the calibration, to first order, with covariances of frames
+    and of the known length.
     """
 
     def in_frames_of(self, urdf: str | Path, tip: str | None = None) -> "MetricModel":
-        """Return the same in the base of a model, with the tool in that of a link of it.
+        """Return the same in the base of a model, with the tool in the frame of one of its links.
 
         The base is where the model fits the calibrated axes best, after the zeros of its inner joints. Those
         of the first and the last joint no image knows: they are as in the model.
@@ -558,7 +558,7 @@ class PlanScene(NamedTuple):
     """Scene of the figure of a plan."""
 
     model: Model  # as calibrated
-    limits: JointLimits  # infinite where none is set
+    limits: JointLimits  # infinite if none is set
     image_size: FloatArray | None  # (V, 2) px, of each; None where unknown
     trajectory: Trajectory  # requested motion
 
@@ -567,8 +567,8 @@ class PlanScene(NamedTuple):
 class MotionPlan(Displayable, Plan):
     """A plan that shows itself."""
 
-    scene: PlanScene | None = None  # of its figure, if at hand
-    asked: tuple[Any, Any] = (None, None)  # start and goal that it was asked for, None of the configuration
+    scene: PlanScene | None = None  # scene of its figure, if at hand
+    asked: tuple[Any, Any] = (None, None)  # start and goal as requested; None for the configuration's
 
     @classmethod
     def of(cls, plan: Plan, scene: PlanScene | None = None, asked: tuple[Any, Any] = (None, None)) -> Self:
@@ -615,7 +615,7 @@ class MotionPlan(Displayable, Plan):
 class RunTrace(Displayable, Trace):
     """A trace that shows itself."""
 
-    face: tuple[int, ...] = ()  # numbers of the markers of the face, where they are known
+    face: tuple[int, ...] = ()  # numbers of the markers of the face, if they are known
 
     @classmethod
     def of(cls, trace: Trace, face: tuple[int, ...] = ()) -> Self:
@@ -627,9 +627,9 @@ class RunTrace(Displayable, Trace):
 
         Parameters
         ----------
-        ax : axes into which the image error of the run is drawn as one curve, beside others; by default a
+        ax : axes into which the image error of the run is drawn as one curve, next to others; by default a
             figure is returned.
-        label : name of that curve; by default that of the law.
+        label : name of that curve; by default the name of the law.
         """
         if ax is not None:
             t = self.period * np.arange(len(self.image_error))

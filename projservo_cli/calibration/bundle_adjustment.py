@@ -74,18 +74,18 @@ class LeastSquares:
 
     Residuals and derivatives are weighted, so all have the noise of a pixel of weight one. The derivative of
     the images is compact: (V, N, 2, c) for each detection by the c parameters it depends on, the last three
-    those of its marker. Offsets of joint readings follow the ``size`` parameters, (K, n) in units of ``tau``,
-    in which their squares count as those of pixels.
+    the parameters of its marker. Offsets of joint readings follow the ``size`` parameters, (K, n) in units
+    of ``tau``, in which their squares count like squared pixels.
     """
 
     detections: Detections
     q: FloatArray  # (K, n) joint values from the reference, rad or m
     q_reference: FloatArray  # (n,) the reference, rad or m
     joint: IntArray  # (n + 1,) first parameter of each joint, then of the lenses if they are estimated
-    shared: int  # number of parameters before those of the markers
+    shared: int  # number of parameters before the parameters of the markers
     size: int  # number of parameters
     columns: IntArray  # (2, c - 3) parameters that all detections of a view depend on
-    # (n,) noise of joint readings over that of pixels, rad/px or m/px; None where readings are exact
+    # (n,) noise of joint readings over pixel noise, rad/px or m/px; None where readings are exact
     tau: FloatArray | None = None
     curve_terms: int = 0  # number of terms of the curve of the joints
     by_twist: FloatArray | None = None  # (K, n, n) of ``q`` by a twist of the flange; None for joints
@@ -130,13 +130,13 @@ class LeastSquares:
         return np.asarray(self.q + (self.by_twist @ params.offsets[..., None])[..., 0])
 
     def strain(self, params: Parameters) -> FloatArray:
-        """Offsets (K, n) over their noise, times that of pixels, px; (0, n) without noise of joints."""
+        """Offsets (K, n) over their noise, times the pixel noise, px; (0, n) without noise of joints."""
         if self.tau is None:
             return np.zeros((0, len(self.q_reference)))
         return np.zeros_like(self.q) if params.offsets is None else np.asarray(params.offsets / self.tau)
 
     def with_noise(self, tau: FloatArray | None) -> "LeastSquares":
-        """Replace the noise of joints (n,) over that of pixels, rad/px or m/px."""
+        """Replace the noise of joints (n,) over pixel noise, rad/px or m/px."""
         return dataclasses.replace(self, tau=tau)
 
     @property
@@ -166,7 +166,7 @@ class LeastSquares:
         return pixels if params.lens is None else distort(params.lens[:, None], pixels), m[..., 2]
 
     def residual(self, params: Parameters) -> FloatArray:
-        """Predicted minus seen pixels (V, N, 2), weighted, zero where not seen."""
+        """Predicted minus seen pixels (V, N, 2), weighted, zero if not seen."""
         detections = self.detections
         residual = np.where(detections.seen[..., None], self.pixels(params)[0] - detections.pixels, 0.0)
         return np.asarray(residual * detections.weight[..., None])
@@ -379,7 +379,7 @@ class _Fit:
     """Parameters and their residuals."""
 
     params: Parameters
-    residual: FloatArray  # (V, N, 2) predicted minus seen, px, zero where not seen
+    residual: FloatArray  # (V, N, 2) predicted minus seen, px, zero if not seen
     cost: float  # weighted sum of squares, px²
 
 
@@ -422,7 +422,7 @@ def _products(J: FloatArray, others: FloatArray) -> FloatArray:
 class _Part(NamedTuple):
     """Derivatives of some observations, times the roots of their weights."""
 
-    at: slice  # of the observations
+    at: slice  # rows of the observations
     shared: FloatArray  # (V, N, 2, c - 3) by the parameters common to all observations of a view
     gone: _Family  # eliminated
     kept: _Family | None  # the other family
@@ -463,7 +463,7 @@ class _Expansion:
         self._scaled(A, C, D, min_scale, gauge)
 
     def _parts(self) -> Iterator[_Part]:
-        """Derivatives of all observations, part by part; kept where they are few."""
+        """Derivatives of all observations, part by part; kept if they are few."""
         N = self.problem.detections.marker_of.size
         if self.known:
             yield from self.known
@@ -520,12 +520,12 @@ class _Expansion:
         gone = (np.ones(of_gone.size) if self.by_pose else marker).reshape(D.shape[:2])
         self.units = kept, gone
         self.A = A[first:, first:] / np.outer(kept, kept)
-        # In place: with many markers this is most of the memory.
+        # Work in place: with many markers this is most of the memory.
         self.C = C[:, :, first:]
         self.C[:, :, : len(kept)] /= kept
         self.C /= gone[:, :, None]
         self.D = D / (gone[:, :, None] * gone[:, None, :])
-        # The prior of the offsets regularizes them; damping regularizes all else.
+        # The prior of the offsets regularizes them; damping regularizes the other parameters.
         self.damped = np.arange(len(kept)) < (len(kept) if self.by_pose else s - first)
         if self.ties:
             G, ties = np.linalg.qr(self.scale[:, None] * gauge)[0], np.zeros((len(kept), self.ties))
@@ -568,7 +568,7 @@ class _Expansion:
             return None
 
         def descent(change: FloatArray, strain: FloatArray) -> FloatArray:
-            """Step of parameters in units, then of offsets in those of tau."""
+            """Step of parameters in units, then of offsets in units of tau."""
             kept, gone = self._gradient(change, strain)
             left = np.linalg.solve(root, gone[..., None])
             x = -lu_solve(factor, kept - flat.T @ left.ravel(), check_finite=False)
@@ -680,7 +680,7 @@ def minimize(
 
 
 def fit_offsets(problem: LeastSquares, params: Parameters) -> Parameters:
-    """Replace the joint offsets of each pose by those of minimum Cauchy loss.
+    """Replace the joint offsets of each pose by the offsets of minimum Cauchy loss.
 
     Poses that do not count are fitted alike: their residuals then decide whether they should.
     """
@@ -696,7 +696,7 @@ def fit_offsets(problem: LeastSquares, params: Parameters) -> Parameters:
 
 
 def _weights(residual: FloatArray, rows: BoolArray, robust: bool) -> FloatArray:
-    """Weights (V, N) of residuals (V, N, 2): one for some detections, or those of their Cauchy loss."""
+    """Weights (V, N) of residuals (V, N, 2): one for some detections, or the weights of their Cauchy loss."""
     if not robust:
         return rows.astype(np.float64)
     distance = np.linalg.norm(residual, axis=2)

@@ -1,6 +1,6 @@
 """Detections of a calibration as flat lists, and refusals of data without motion or without two dimensions.
 
-The checks need joint readings, marker numbers and pixels, and no geometry yet. At the end stand deviations
+The checks need joint readings, marker numbers and pixels, and no geometry yet. At the end come deviations
 and weights of residuals. Fits by reweighting solve other equations in each round, in closed form and many at
 once, so that each keeps its own loop: two-view geometry, rigid motions, axis points and the adjustment.
 """
@@ -57,9 +57,9 @@ MAX_JUDGED = 50
 _MIN_SPREAD = 5.0
 # Ratio of both spreads above which pixels lie on a line rather than in one spot.
 _ELONGATED = 10.0
-# Share of observations, assumed wrong, that may move more than the rest while the robot stands still.
+# Share of observations, assumed wrong, that may move more than the rest while the robot is at rest.
 _MAX_WRONG = 0.1
-# A view stands still whose images move less than this share of those of another one, and less than that, px.
+# A view is at rest if its images move less than this share of another view's motion, and less than that, px.
 STILL_SHARE, STILL_PX = 0.03, 3.0
 # Minimum share of a beginning, or an end, of the poses that is nearly all of it.
 _NEARLY_ALL = 0.9
@@ -83,12 +83,12 @@ class Detections:
     marker: IntArray  # (m,) numbers of the markers
     pose_of: IntArray  # (N,) row of ``q``
     marker_of: IntArray  # (N,) index into ``marker``, never falling
-    pixels: FloatArray  # (V, N, 2) px, zero where not seen
+    pixels: FloatArray  # (V, N, 2) px, zero if not seen
     seen: BoolArray  # (V, N) whether the view saw the marker
     weight: FloatArray  # (V, N) weights of residuals: ``stated_px`` over the standard deviation, or one
     stated_px: float | None  # median of the stated standard deviations, px, if any
     view: tuple[str, ...] = VIEWS  # names of the views
-    mount: str = WORLD  # of cameras on the tool, the chain is that of the scene: joints in reverse, negated
+    mount: str = WORLD  # with cameras on the tool, the chain ends at the scene: joints in reverse, negated
     pair: tuple[int, ...] = (0, 1)  # the one or two views by which a fit begins and noise is known
     chart: FlangeChart | None = None  # of poses of the flange; None for joints
 
@@ -104,18 +104,18 @@ class Detections:
         letters = joint_types.upper()
         n = observation.q.shape[1]
         if len(letters) != n or set(letters) - {"R", "P"}:
-            raise InputError(f"joint types {joint_types!r}: expected {n} letters R or P, one a joint")
+            raise InputError(f"joint types {joint_types!r}: expected {n} letters R or P, one per joint")
         if not np.isfinite(observation.q).all():
             raise InputError("joint readings must be finite numbers")
         if np.isinf(observation.images).any():
-            raise InputError("pixels must be finite numbers, or missing where a marker was not seen")
+            raise InputError("pixels must be finite numbers, or missing if a marker was not seen")
         finite = np.asarray(np.isfinite(observation.images).all(axis=3))
         marker_of, pose_of = np.nonzero(finite.any(axis=1).T)
         seen = finite[pose_of, :, marker_of].T
         weight, stated_px = np.ones(seen.shape), None
         if observation.sigma is not None and seen.any():
             sigma = np.maximum(observation.sigma[pose_of, :, marker_of].T[seen], MIN_SIGMA)
-            # Their root mean square would be that of the few loosest, which hardly count.
+            # Their root mean square would come from the few loosest, which hardly count.
             stated_px = float(np.median(sigma))
             weight[seen] = stated_px / sigma
         q, prismatic = np.array(observation.q, dtype=np.float64), prismatic_of(letters)
@@ -278,7 +278,7 @@ class Detections:
             candidates = candidates[changed <= 1]
         if candidates.size == 0:
             return None
-        # With trials of a single joint every row qualifies: take the one in the middle.
+        # Given trials of a single joint every row qualifies: take the one in the middle.
         travel = [np.abs(q[candidate] - q).sum() for candidate in candidates]
         return int(candidates[np.argmin(travel)])
 
@@ -404,8 +404,10 @@ def weak_joints(
             order = 2 if needed[i] <= span[i] else 3
         limit = "amplitude" if span[i] < reach[i] else "geometry"
         subject = Subject(joints=(int(detections.numbers[i]),), name=limit)
-        most = math.nan if order == 0 else float(needed[i])
-        finding = Finding(_WEAK[order], LIMITS, subject, float(span[i]), limit=most, unit=detections.units[i])
+        min_span = math.nan if order == 0 else float(needed[i])
+        finding = Finding(
+            _WEAK[order], LIMITS, subject, float(span[i]), limit=min_span, unit=detections.units[i]
+        )
         found.append((order, finding))
     return [finding for _, finding in sorted(found, key=lambda one: one[0])]
 
@@ -423,7 +425,7 @@ def require_moved(number: int, span: float, unit: str, motion_px: float, sigma_p
         advice = f"joint {number} moved only {quantity(span, unit)}: move it at least {needed}"
         raise WorkFailed(f"too little excitation: the range of joint {number} moves {seen}; {advice}")
     raise WorkFailed(
-        f"joint {number} stands still: its readings range over {quantity(span, unit)} but "
+        f"joint {number} does not move: its readings range over {quantity(span, unit)} but "
         f"move {seen}; check that it moved and that its readings are its own, or move a marker off its axis"
     )
 
@@ -493,7 +495,7 @@ def _require_spread(detections: Detections, sigma: float) -> None:
 
 
 def _require_moving(detections: Detections, sigma: float) -> None:
-    """Refuse images that stand still while the joint readings move: all, or those of a joint's trials."""
+    """Refuse images that do not move while the joint readings move: all, or the trials of a joint."""
     limit = MIN_MOTION * sigma
     if _farthest(detections) < limit:
         raise WorkFailed(
@@ -506,8 +508,8 @@ def _require_moving(detections: Detections, sigma: float) -> None:
     for i, rows in enumerate(detections.trials(home)):
         poses = np.zeros(len(detections.q), dtype=bool)
         poses[np.append(rows, home)] = True
-        # A point that moves evenly along a path of length L has variance L² / 12; noise adds that of both
-        # coordinates.
+        # A point that moves evenly along a path of length L has variance L² / 12; noise adds the variance of
+        # both coordinates.
         square = 12.0 * _variances(*_tracks(detections.of_poses(poses))).sum(axis=1)
         path = np.sqrt(max(float(square.mean()) - 24.0 * sigma**2, 0.0)) if square.size else np.inf
         span = float(np.ptp(detections.q[poses, i]))
@@ -515,14 +517,14 @@ def _require_moving(detections: Detections, sigma: float) -> None:
 
 
 def _require_all_moving(detections: Detections) -> None:
-    """Refuse a view that stands still while another moves: the fit would name the joints or the other."""
+    """Refuse a view at rest while another moves: the fit would name the joints or the other."""
     moved = [_farthest(detections.of_views([v])) for v in range(len(detections.view))]
-    still, most = int(np.argmin(moved)), int(np.argmax(moved))
-    if np.isfinite(moved[most]) and moved[still] < min(STILL_SHARE * moved[most], STILL_PX):
+    still, moving = int(np.argmin(moved)), int(np.argmax(moved))
+    if np.isfinite(moved[moving]) and moved[still] < min(STILL_SHARE * moved[moving], STILL_PX):
         raise WorkFailed(
             f"the {detections.view[still]} images stand still within {moved[still]:.3g} px, while the "
-            f"{detections.view[most]} ones move by {moved[most]:.3g} px: look whether that camera hangs, and "
-            "whether its numbers are those of the markers that move"
+            f"{detections.view[moving]} images move by {moved[moving]:.3g} px: check whether that camera "
+            "hangs, and whether its markers have the numbers of the markers that move"
         )
 
 

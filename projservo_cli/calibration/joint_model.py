@@ -1,10 +1,10 @@
-"""Joints that are not ideal: curves of readings, coupling and deflection, fitted with all else.
+"""Joints that are not ideal: curves of readings, coupling and deflection, fitted with all other parameters.
 
 Each hypothesis is a row of ``DEVIATIONS`` with functions that add terms to the curve of true joints by
 readings; sag is a deflection of each revolute joint that follows the torque of weights at the tool, or along
-the arm. Automatic choice takes one by one what the score tests name, and what explains the images about as
-well. It keeps the hypothesis that predicts left-out poses best, if by more than chance, and stops where none
-does.
+the arm. Automatic choice takes one by one the terms that the score tests name, and that explain the images
+about as well. It keeps the hypothesis that predicts left-out poses best, if by more than chance, and stops
+if none does.
 """
 
 import dataclasses
@@ -46,7 +46,7 @@ _OPEN = np.radians(5.0)
 # Deviations from zero below which a term of one joint of many is left out: H. Akaike's criterion of 1974, by
 # which a parameter is worth a gain of two in χ².
 _APART = 1.41
-# Deflection by the largest torque, rad, beyond that of any joint.
+# Deflection by the largest torque, rad, beyond the deflection of any joint.
 _BENDS = np.radians(5.0)
 # Minimum determinant of the derivatives of true joints by readings, within the recorded poses.
 _FOLDS = 0.2
@@ -65,14 +65,14 @@ class Hypothesis(NamedTuple):
 
     @property
     def words(self) -> str:
-        """Name as it is asked for, such as scale:2 or coupling:4-5."""
+        """Name as configured, such as scale:2 or coupling:4-5."""
         return ":".join(filter(None, (self.kind, "-".join(map(str, self.joints)))))
 
 
 def hypotheses_of(asked: str | Iterable[str], joint_types: str, mount: str) -> list[Hypothesis]:
     """Return the hypotheses of words such as scale, scale:2, coupling:4-5 or sag, for joints R or P.
 
-    Raises InputError naming a word that none has, or what no image shows.
+    Raises InputError for an unknown word, or a term that no image shows.
     """
     found, n = list[Hypothesis](), len(joint_types)
     asked = asked.split(",") if isinstance(asked, str) else asked
@@ -101,7 +101,7 @@ def hypotheses_of(asked: str | Iterable[str], joint_types: str, mount: str) -> l
             )
         if row.turns and set(joints) & set(slides):
             raise InputError(f"joint model {word!r}: prismatic joint {joints[0]} has no turn; leave it out")
-        # A coupling needs two joints, a prismatic joint has no turn, and the first one no scale; where none
+        # A coupling needs two joints, a prismatic joint has no turn, and the first one no scale; if none
         # turns, the load of each is constant.
         others = {"coupling": n - 1, "scale": n - bool(slides)}
         if not others.get(kind, n - len(slides) if row.turns else n):
@@ -201,7 +201,7 @@ def describe_curve(calibration: Calibration) -> list[dict[str, Any]]:
 
 
 def _in_all(named: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """Return kinds in all joints, the most frequent first, of those that are named for several joints."""
+    """Return kinds that are named for several joints, in all joints, by decreasing frequency."""
     kinds = Counter(one.kind for one in named if len(one.joints) == 1)
     return [Hypothesis(kind, ()) for kind, count in kinds.most_common() if count > 1]
 
@@ -231,14 +231,16 @@ class _Search:
         if any(one.kind == "sag" for one in chosen) and not len(before.arm):
             arms = [_arm(near, spread) for spread in (False, True)]
         problem, detections = near.problem, near.problem.detections
-        bent = LeastSquares.of(detections, problem.q_reference, problem.lens_terms, len(terms))
+        with_curves = LeastSquares.of(detections, problem.q_reference, problem.lens_terms, len(terms))
         fits = list[Solution]()
         for arm in arms:
             params = dataclasses.replace(near.params, curve=JointCurve(terms, arm), offsets=None)
-            found = fit_from(bent, params, self.epipolar)
+            found = fit_from(with_curves, params, self.epipolar)
             if found is None or found.params.curve is None:
                 continue
-            F = slopes(found.params.curve, found.params.prismatic, bent.q[np.unique(detections.pose_of)])
+            F = slopes(
+                found.params.curve, found.params.prismatic, with_curves.q[np.unique(detections.pose_of)]
+            )
             fits += [found] if np.linalg.det(F).min() >= _FOLDS else []
         return min(fits, key=lambda fit: fit.sigma_px) if fits else None
 
@@ -253,8 +255,8 @@ class _Search:
             if not better:
                 break
             refused.update(set(named) - {one for _, one, _ in better})
-            most = max(gain for (gain, _), _, _ in better)
-            alike = [trial for trial in better if trial[0][0] >= _AS_MUCH * most]
+            max_gain = max(gain for (gain, _), _, _ in better)
+            alike = [trial for trial in better if trial[0][0] >= _AS_MUCH * max_gain]
             _, one, fit = min(alike, key=lambda trial: (trial[2].problem.curve_terms, -trial[0][0]))
             self.gains[one], best = left_out_px(best), fit
             chosen.append(one)
@@ -292,9 +294,9 @@ class _Search:
         curve, params, problem = found.params.curve, found.params, found.problem
         assert curve is not None
         deviation = _deviations(found)
-        most = np.abs(basis(curve, params.prismatic, problem.q)).max(axis=0)
+        max_gain = np.abs(basis(curve, params.prismatic, problem.q)).max(axis=0)
         joint = curve.terms[:, 1].astype(int)
-        off = deviation * most / per_rad(params.prismatic)[joint]
+        off = deviation * max_gain / per_rad(params.prismatic)[joint]
         t = int(np.argmax(off))
         if off[t] <= _OPEN:
             return
@@ -313,8 +315,9 @@ class _Search:
 def _gain(before: Solution, after: Solution) -> tuple[float, float]:
     """Decrease of squared errors at left-out poses, px², and that over its deviation by chance.
 
-    By detections that count in both fits. The squares of errors e + δ exceed those of e by 2 e·δ + δ², where
-    e is noise if the later fit is right: sums of 2 e·δ over poses have mean zero, and show their deviation.
+    By detections that count in both fits. The squares of errors e + δ exceed the squares of e by 2 e·δ + δ²,
+    where e is noise if the later fit is right: sums of 2 e·δ over poses have mean zero, and show their
+    deviation.
     """
     before, after = before.thinned(MAX_JUDGED), after.thinned(MAX_JUDGED)
     first, e = left_out_errors(before), left_out_errors(after)

@@ -2,7 +2,7 @@
 
 The residual of the images of pose k is r = J x + G δ + ε, with ε ~ N(0, σ² I) and δ ~ N(0, σ_q² I), the true
 joints less their readings; its covariance is S = σ² I + σ_q² G Gᵀ. Errors of pixels scatter from marker to
-marker, while those of joints move all markers of a pose together: this separates them.
+marker, while errors of joints move all markers of a pose together: this separates them.
 
 The likelihood takes the markers with most inliers, since more markers say little more about few joints.
 
@@ -25,9 +25,9 @@ from projservo_cli.calibration.detections import MIN_SIGMA, per_rad
 from projservo_cli.calibration.prediction import Parameters
 from projservo_cli.records import BoolArray, FloatArray
 
-# Minimum noise of joints searched, rad, that of the best encoders.
+# Minimum noise of joints searched, rad, as of the best encoders.
 _MIN_SIGMA_Q = 1e-6
-# Maximum noise of joints searched, rad, beyond that of any robot.
+# Maximum noise of joints searched, rad, beyond the noise of any robot.
 _MAX_SIGMA_Q = np.radians(1.0)
 # Number of noise ratios in the scan.
 _GRID = 33
@@ -36,13 +36,13 @@ _GRID = 33
 _LEVERS, _LEVER_STEPS, _ROUGH_GRID = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0), 8, 13
 # Logarithm by which the lower end of the interval may lie below the scan.
 _FARTHER = 5.0
-# Deviance where the likelihood is not defined.
+# Deviance if the likelihood is not defined.
 _NEVER = 1e30
 # Logarithm of a noise ratio of zero.
 _NONE = -np.inf
 # Minimum share of the residual noise that stays with the pixels.
 _SHARE = 0.001
-# Information of a direction, over that of the best known one, below which images leave it open.
+# Information of a direction, over the best known direction, below which images leave it open.
 _OPEN = 1e-12
 # Deviance that χ² exceeds by chance in 1 of 100 cases at the border of the parameters: Self and Liang.
 _SIGNIFICANT = 5.412
@@ -92,7 +92,7 @@ class JointNoise:
 
         sigma_px : noise of pixels, None for any that is at least ``min_px``.
 
-        Zero if it is not significant; that of encoder ticks if readings lie on ticks and the interval
+        Zero if it is not significant; the noise of encoder ticks if readings lie on ticks and the interval
         contains it.
         """
         detections = problem.detections
@@ -124,10 +124,10 @@ class JointNoise:
             return likelihood.deviance(at) - minimum - _INTERVAL
 
         low, high = 0.0, _MAX_SIGMA_Q
-        least = log_ratios[0] - _FARTHER
+        low_end = log_ratios[0] - _FARTHER
         # Residuals of tens of px, as of images of two sizes, leave no noise of joints that is too small.
-        if none - minimum > _INTERVAL and beyond(least) > 0.0:
-            low = likelihood.sigma_q(brentq(beyond, least, log_ratio))
+        if none - minimum > _INTERVAL and beyond(low_end) > 0.0:
+            low = likelihood.sigma_q(brentq(beyond, low_end, log_ratio))
         if beyond(log_ratios[-1]) > 0.0:
             high = likelihood.sigma_q(brentq(beyond, log_ratio, log_ratios[-1]))
         if high >= _MAX_SIGMA_Q:  # a wrong model asks for any amount of noise
@@ -241,7 +241,7 @@ class _Likelihood:
         return float(self.dof * np.log(left) + logs)
 
     def sigma(self, log_ratio: float) -> float:
-        """Noise of pixels, px: as given, else the maximum-likelihood one."""
+        """Noise of pixels, px: as given, otherwise the maximum-likelihood one."""
         if self.given is not None:
             return self.given
         return float(np.sqrt(self._parts(log_ratio)[0] / max(self.dof, 1)))

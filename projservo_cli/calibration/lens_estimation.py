@@ -87,7 +87,7 @@ def _geometry_of(detections: Detections, frame: ImageFrame, rng: np.random.Gener
 def fit_lens(solution: Solution, search: Search) -> tuple[Solution, ImageGeometry]:
     """Fit with radial distortion, and estimate the epipolar geometry of the undistorted detections.
 
-    The distortion is centred on the image, or where the residuals show another centre that predicts left-out
+    The distortion is centred on the image, or if the residuals show another centre that predicts left-out
     poses better, on that. Inliers are selected again. Raises WorkFailed if the data do not determine the
     distortion.
     """

@@ -96,11 +96,11 @@ from projservo_cli.records import (
 
 # Fitted over expected noise above which a fit that passes may still have one joint at fault.
 _DOUBTFUL_RATIO = 2.0
-# Motion of images by the noise of joints over pixel noise, from which it may hide what is not as given.
+# Motion of images by the noise of joints over pixel noise, from which it may hide a wrong input.
 _DOUBTFUL_JOINTS = 10.0
 # Maximum share of the noise that a relabelling leaves if it is right, and if data as given are refuted.
 _DOUBTFUL_SHARE, _REFUTED_SHARE = 0.5, 0.2
-# Maximum noise over that of a fit as given, of one with a joint of the other type for which the images speak.
+# Maximum noise over the noise of a fit as given, for a fit with another type of a joint that images support.
 _AS_GOOD = 1.05
 # Minimum share of the squared residuals that makes a lens the likely cause of a misfit.
 _DECISIVE_SHARE = 0.5
@@ -110,11 +110,11 @@ _NO_LENS_TAIL = 0.01
 _MAX_REJECTED = 0.4
 # Maximum share of the pixels of a view outside its image, as outliers may be.
 _STRAYS = 0.1
-# That for an estimation of the lens, whose middle is that of the image.
+# The same to estimate the lens, whose middle is the image's.
 _LENS_STRAYS = 0.01
 # Distance beyond the border of an image, px, within which a search for corners may place one.
 _BEYOND_PX = 1.0
-# Noise of a camera over that of the quietest one from which it is named.
+# Noise of a camera over the quietest camera from which it is named.
 _NOISY = 2.0
 
 
@@ -148,7 +148,7 @@ def calibrate(
     image_size : width and height, px, for the start of the search; None takes the extent of the data.
     seed : seed of the random starts.
     lens : whether to estimate two coefficients of radial distortion a camera, about the image centre or,
-        where the images show another one, about that.
+        if the images show another one, about that.
     init : robot and rig that ``bundle_adjustment`` tries first as a start; a search follows if that fails.
     joint_noise : standard deviation of joint readings, rad (prismatic × 0.3 m/rad), for
         ``bundle_adjustment``; None estimates it, and takes 0 unless the images show it.
@@ -216,9 +216,9 @@ def calibrate(
         asked = lens, init, curves
         solution, expected, result = _maximum_likelihood(search, whole, frame, expect, asked, limit)
         if of_still:
-            standing_too = np.column_stack([numbers, np.full(len(numbers), WHY_LOST.index("still"))])
-            known = standing_too[:0] if result.rejected_markers is None else result.rejected_markers
-            lost = np.concatenate([known, standing_too])
+            still_too = np.column_stack([numbers, np.full(len(numbers), WHY_LOST.index("still"))])
+            known = still_too[:0] if result.rejected_markers is None else result.rejected_markers
+            lost = np.concatenate([known, still_too])
             result = changed(with_findings(result, of_still), rejected_markers=lost)
         seconds = time.perf_counter() - begin
         if fitted is not None:
@@ -357,7 +357,7 @@ def _refined(
                 )
     except Misfit as refused:
         hint = main_deviation(solution, expected) if share < _DECISIVE_SHARE else of_lens
-        by_joints = refused.findings[0].code in ("several_joints", "erring_joint")  # nothing else moved
+        by_joints = refused.findings[0].code in ("several_joints", "erring_joint")  # no other part moved
         if hint is None or (by_joints and not hint.subject.joints):
             raise
         raise Misfit.by([*refused.findings, hint], detections) from None
@@ -413,7 +413,10 @@ def _record(
     counts = len(found.suspect) + len(found.poses), len(found.id_switches)
     verdict = assess(solution, errors, expected, outlier, counts, suspicion, limit_px)
     check, (about, *rest) = verdict.check, verdict.findings
-    of_images = *moved_images(detections, found.moved), *findings_on_imaged_poses(detections, found.shown)
+    of_images = (
+        *moved_images(detections, found.moved),
+        *findings_on_imaged_poses(detections, found.mismatched),
+    )
     findings = (about, *rest, *of_images)
     # Deviations hold on average over other poses, with the model's own error.
     factor = 1.0
@@ -497,7 +500,7 @@ def _joint_evidence(
 
 
 def _rejections(detections: Detections, found: Outliers, outlier: IntArray) -> Rejections:
-    """Detections that a fit left out, with what explains them."""
+    """Detections that a fit left out, with their explanations."""
     return Rejections(
         outlier=outlier,
         suspect=np.stack(

@@ -104,12 +104,12 @@ class Images(NamedTuple):
         return by_joint if self.slopes is None else np.asarray(by_joint @ self.slopes)
 
     def by_motion(self, generators: FloatArray, behind: int) -> FloatArray:
-        """Derivative (V, N, 2, d) by motions (d, 4, 4) of what is behind a joint: 0 the base, −1 the tool."""
+        """Derivative (V, N, 2, d) by motions (d, 4, 4) of parts behind a joint: 0 the base, −1 the tool."""
         velocity = np.einsum("dab,Nb->Nad", generators, self.points[behind])
         return np.asarray(self.by_point[behind] @ velocity)
 
     def of_own_poses(self) -> "Images":
-        """Images of all markers by each view at a pose of its own, of as many poses as views: (1, N)."""
+        """Images of all markers by each view at its respective pose, of as many poses as views: (1, N)."""
         V, N = self.pixels.shape[:2]
         own = np.repeat(np.arange(V), N // V), np.arange(N)
         return Images(
@@ -176,8 +176,8 @@ class Parameters:
         for i, by_joint in enumerate(E):
             D[i + 1] = D[i] @ by_joint
         by_camera = (G[..., None] * Y[0][:, None, None, :]).reshape(*pixels.shape, CAMERA)
-        bent = None if self.curve is None else slopes(self.curve, self.prismatic, q)[pose_of]
-        return Images(pixels, Y, by_camera, D, by_lens, bent)
+        curve_slopes = None if self.curve is None else slopes(self.curve, self.prismatic, q)[pose_of]
+        return Images(pixels, Y, by_camera, D, by_lens, curve_slopes)
 
     def everywhere(self, q: FloatArray) -> Images:
         """Images of all markers at joints (K, n), pose by pose, with derivatives."""
@@ -189,7 +189,7 @@ class Parameters:
 
         Of shapes (K, V, m, 2, 12 V + 16 n), with more columns for the ``lens_terms`` of both views and the
         terms of the curve, and (K, V, m, 2, 4). An operator enters by E = I + s Ĥ + c Ĥ², [RH00] eqs. (4),
-        (5), so dE = s dĤ + c (dĤ Ĥ + Ĥ dĤ). images : those of ``everywhere``, if known.
+        (5), so dE = s dĤ + c (dĤ Ĥ + Ĥ dĤ). images : result of ``everywhere``, if known.
         """
         (K, n), m = q.shape, len(self.M)
         pose_of = np.repeat(np.arange(K), m)
@@ -230,7 +230,7 @@ class Parameters:
 
 
 def parameters_from(calibration: Calibration) -> Parameters:
-    """Parameters of a calibration record; of cameras on the tool, those of the chain of the scene."""
+    """Parameters of a calibration record; for cameras on the tool, of the chain of the scene."""
     c, way = calibration, -1 if calibration.mount == TOOL else 1
     prismatic, terms, curve = c.prismatic[::way], c.lens_terms, c.curve
     if curve is not None and c.mount == TOOL:

@@ -37,7 +37,7 @@ class Projective:
     def errors(self, solution: Solution, errors: Errors) -> Errors:
         """Errors of P, H_hat, k1 and k2 if lenses are estimated, and M, at a noise of one pixel.
 
-        errors : those of ``Solution.errors``.
+        errors : as of ``Solution.errors``.
         Raises WorkFailed if the markers cannot be distinguished from a line.
         """
         found = self._in_frame(solution, errors)
@@ -46,9 +46,9 @@ class Projective:
         return found
 
     def bias(self, solution: Solution, bias: FloatArray) -> FloatArray:
-        """Errors (p, k) of P, H_hat, lenses and M by those of the parameters, of the markers judged.
+        """Errors (p, k) of P, H_hat, lenses and M by the errors of the parameters, of the markers judged.
 
-        Markers beyond follow no error of their own.
+        Markers beyond follow no separate error.
         """
         m, s = len(self.params.M), solution.problem.shared
         marker = np.zeros((m, 3, bias.shape[1]))
@@ -114,7 +114,7 @@ def _isotropic(params: Parameters, a_inf: FloatArray, moved: FloatArray) -> Proj
 def _require_off_line(params: Parameters, errors: Errors) -> None:
     """Refuse markers that their errors do not distinguish from a line.
 
-    A line is the span of two points. The markers must be off it by several times the noise of that distance,
+    A line is the span of two points. The markers must be off it by several times the noise of this distance,
     in any frame and scale: the gauge and their scales are free.
     """
     M, factor = params.M, errors.dense()

@@ -4,7 +4,7 @@ Operators, markers and all other cameras stay. The camera minimizes residuals we
 and joints, x̂ = G r. Weights by the covariance of operators and markers as well would give the camera itself
 smaller errors, but larger ones to predictions, which use these operators and markers. To first order images
 are r = J x − T e + n, with errors e of the rest of the calibration and noise n: the camera errs by −G T e +
-G n, so that the covariance of old and new numbers stays that of one calibration.
+G n, so that the covariance of old and new numbers stays consistent with one calibration.
 
 Joint readings are judged by generalised least squares of all views, of covariance I + T Tᵀ: G. A. F. Seber,
 A. J. Lee, "Linear Regression Analysis", 2nd ed., 2003, section 3.10.
@@ -95,7 +95,7 @@ class ViewError(NamedTuple):
 
     view: str
     off_px: float  # NaN without a detection
-    expected_px: float  # by noise and covariance
+    expected_px: float  # error by noise and covariance
 
     @property
     def disagrees(self) -> bool:
@@ -122,7 +122,7 @@ def view_errors(calibration: Calibration, observation: Observation) -> tuple[Vie
 class _Images:
     """Images at new poses, in the order of a calibration; residuals and derivatives in units of noise."""
 
-    calibration: Calibration  # of the markers seen
+    calibration: Calibration  # calibration of the markers seen
     problem: LeastSquares
     which: IntArray  # (m,) indices of these markers
 
@@ -243,7 +243,7 @@ def refit(
         If the calibration has no such view or no covariance, or the observation has not that view.
     WorkFailed
         If the camera has not moved, or the images do not determine it, or do not confirm the joint readings:
-        the number, its limit, and what would.
+        the number, its limit, and the data that would.
     """
     for names, of in ((calibration.view, "calibration"), (observation.view, "images")):
         if view not in names:
@@ -269,12 +269,12 @@ def _require_moved(images: _Images, view: str) -> None:
         return
     nothing = np.zeros((*images.problem.detections.pixels.shape, 0))
     _JointOffsets.of(images, params, errors, images.near(params, errors), nothing).require_none(images, view)
-    told = tuple(one.finding for one in views if np.isfinite(one.off_px))
-    raise failed([Finding("unmoved_camera", REFUSES, Subject(views=(view,)), others=told)])
+    reasons = tuple(one.finding for one in views if np.isfinite(one.off_px))
+    raise failed([Finding("unmoved_camera", REFUSES, Subject(views=(view,)), others=reasons)])
 
 
 def since_moved(old: Observation, new: Observation, view: str) -> Observation:
-    """Images at rest of old and new poses; those of a camera that moved between them are the new ones."""
+    """Images at rest of old and new poses; a camera that moved between them keeps the new ones."""
     old, new, v = old.at_rest, new.at_rest, old.view.index(view)
     images = np.full((len(old.q) + len(new.q), *old.images.shape[1:]), np.nan)
     images[: len(old.q)], images[: len(old.q), v] = old.images, np.nan
@@ -299,7 +299,7 @@ def _fitted(images: _Images, v: int) -> _Camera:
     if seen.sum() < _LEAST:
         raise failed([open_])
     params = parameters_from(c)
-    # To a frame whose plane at infinity is the last coordinate, where points have finite ones.
+    # Change to a frame whose plane at infinity is the last coordinate, where points have finite ones.
     frame = np.vstack([np.linalg.svd(c.a_inf[None])[2][1:], c.a_inf])
     points = params.moved(problem.q, found.pose_of, found.marker_of)[seen[v]] @ frame.T
     straight = found.pixels if params.lens is None else undistort(params.lens, found.pixels)
@@ -360,7 +360,7 @@ def rows_of_camera(c: Calibration, v: int) -> IntArray:
 
 
 def errors_of_others(c: Calibration, v: int, errors: Errors | None = None) -> Errors:
-    """Errors of a calibration but for those of one camera."""
+    """Errors of a calibration except the errors of one camera."""
     errors = errors_of(c) if errors is None else errors
     shared = errors.shared.copy()
     shared[rows_of_camera(c, v)] = 0.0
@@ -368,22 +368,22 @@ def errors_of_others(c: Calibration, v: int, errors: Errors | None = None) -> Er
 
 
 class _JointOffsets(NamedTuple):
-    """Offsets of single joints by images of all views, across what a camera can do."""
+    """Offsets of single joints by images of all views, orthogonal to motions of the camera."""
 
     offset: FloatArray  # (n,) in rad × ``per_rad``
-    square: FloatArray  # (n,) information on each; infinite where the camera moves images alike
+    square: FloatArray  # (n,) information on each; infinite if the camera moves images alike
     effect: FloatArray  # (n,) rms motion of the images by each, over their noise
     left: float  # sum of squares that the camera leaves
     coordinates: float  # number of those seen
-    numbers: int  # of the camera
+    numbers: int  # number of parameters of the camera
 
     @classmethod
     def of(
-        cls, images: _Images, params: Parameters, errors: Errors, mask: BoolArray, beside: FloatArray
+        cls, images: _Images, params: Parameters, errors: Errors, mask: BoolArray, by_cameras: FloatArray
     ) -> "_JointOffsets":
         """Test each joint by residuals of covariance I + T Tᵀ and noise of joints.
 
-        mask : (V, N) detections that count; beside : (V, N, 2, k) changes by what a camera can do.
+        mask : (V, N) detections that count; by_cameras : (V, N, 2, k) changes by parameters of the cameras.
         """
         problem, found = images.problem, images.problem.detections
         mask = mask & np.isin(found.marker_of, even_choice(found.marker.size, MAX_JUDGED))
@@ -393,12 +393,12 @@ class _JointOffsets(NamedTuple):
         )
         per = per_rad(params.prismatic)
         columns = (
-            *(beside, problem.joint_derivative(params) * per),
+            *(by_cameras, problem.joint_derivative(params) * per),
             *(problem.residual(params)[..., None], T),
         )
         stacked = np.concatenate(columns, axis=-1) * mask[..., None, None]
         stacked = problem.whitened(params, stacked.reshape(-1, stacked.shape[-1]), mask)
-        n, k = len(per), beside.shape[-1]
+        n, k = len(per), by_cameras.shape[-1]
         Y, T = np.hsplit(stacked, [k + n + 1])
         crossed = T.T @ Y
         gram = Y.T @ Y - crossed.T @ np.linalg.solve(np.eye(T.shape[1]) + T.T @ T, crossed)
@@ -438,8 +438,8 @@ def _of_joint(images: _Images, view: str, code: str, i: int, amount: float, **mo
 def _require_confirmed(camera: _Camera) -> float:
     """Refuse joint readings that images contradict, or that nothing confirms; the noise over that expected.
 
-    Across what the camera can do, an offset of each joint is tested for what it is, and for what would pass
-    unnoticed.
+    Orthogonal to motions of the camera, an offset of each joint is tested for what it is, and for what would
+    pass unnoticed.
     """
     images, v, params = camera.images, camera.v, camera.params
     found, c = images.problem.detections, images.calibration
@@ -466,7 +466,7 @@ def _record(
 ) -> Calibration:
     """Calibration with a camera as fitted, at a ratio to the expected noise.
 
-    limit_px : error above which it is not usable; infinite to take that of the extent of the images.
+    limit_px : error above which it is not usable; infinite to take the limit by the extent of the images.
     """
     images, v, which, rows = camera.images, camera.v, camera.images.which, rows_of_camera(c, camera.v)
     found, count, errors = images.problem.detections, len(rows), errors_of_others(images.calibration, v)
@@ -477,7 +477,7 @@ def _record(
     noise, marker, own_errors = ratio * camera.root, c.sqrt_cov_marker, c.sqrt_cov_own.copy()
     apart_ = which.size <= _MOST_APART
     if not apart_:
-        # Of many markers each hardly matters to the camera: their errors count as independent ones.
+        # Each of many markers hardly matters to the camera: their errors count as independent ones.
         noise, by_own = np.asarray(np.linalg.qr(np.hstack([noise, by_own]).T, mode="r")).T, by_own[:, :0]
     first, more = c.sqrt_cov_shared.shape[1], by_own.shape[1] + noise.shape[1]
     shared = np.pad(c.sqrt_cov_shared, ((0, 0), (0, more)))
@@ -541,7 +541,7 @@ def _judged(c: Calibration, v: int, error: list[float], pose_of: IntArray, limit
     code, severity = ("refit_too_coarse", REFUSES) if now > limit else ("refitted_camera", LIMITS)
     from_poses = (Finding(code, amount=poses, unit="1"),)
     held, subject = limit if now > limit else before, Subject(views=(name,))
-    told = Finding(code, severity, subject, now, limit=held, unit="px", effect_px=now, others=from_poses)
+    reasons = Finding(code, severity, subject, now, limit=held, unit="px", effect_px=now, others=from_poses)
     grown: dict[str, Any] = {}
     for field in ("predicted_rms_px", "predicted_p99_px", "predicted_recorded_px", "predicted_worst_px"):
         if (px := getattr(c, field)) is not None:
@@ -552,4 +552,4 @@ def _judged(c: Calibration, v: int, error: list[float], pose_of: IntArray, limit
         numbers = np.concatenate([old.refit_numbers, numbers])
         refits = Refits(refit=(*old.refit, name), refit_numbers=numbers)
     c = changed(c, refits=refits, **grown)
-    return with_findings(c, (), [told] if now > min(limit, _MORE * before) else [])
+    return with_findings(c, (), [reasons] if now > min(limit, _MORE * before) else [])

@@ -32,7 +32,7 @@ WARN_RATIO = 1.15
 _WARN_ERRORS = 4.0
 # Fitted over expected noise above which the model does not describe the data.
 REFUSE_RATIO = 3.0
-# Error of predictions, over the image size, above which a calibration is not usable, where none is set.
+# Error of predictions, over the image size, above which a calibration is not usable, if none is set.
 MAX_PREDICTED = 0.01
 # Probability with which χ² of a true model lies beyond either end of its band.
 _CHI2_TAIL = 1e-4
@@ -60,15 +60,16 @@ _MANY = 0.01
 _FLICKER = 2e-4
 # Minimum number of detections of a marker that support each other if others do not fit.
 _VERIFIED = 3
-# Noise over that of the rig above which the model errs and misfits need not be wrong detections.
+# Noise over the noise of the rig above which the model errs and misfits need not be wrong detections.
 _RIG = 1.5
 # Probability that noise alone rejects all detections of a pose.
 _POSE_TAIL = 1e-7
 # Minimum share of inliers among the detections of a marker that is part of the model.
 _MIN_SHARE = 0.25
-# Noise over that of the rig after the robust search above which a start is wrong.
+# Noise over the noise of the rig after the robust search above which a start is wrong.
 _HOPELESS = 10.0
-# Minimum relative gain over ``_PATIENCE`` steps of a robust search whose result would be refused so far.
+# Minimum relative gain over ``_PATIENCE`` steps of a robust search whose result would be refused at that
+# point.
 _CRAWL = 0.01
 # Number of steps over which this gain is measured.
 _PATIENCE = 10
@@ -115,7 +116,7 @@ class Solution:
     residual: FloatArray  # (V, N, 2) predicted minus seen, px, weighted
     used: BoolArray  # (V, N) detections that count; the rest of those seen are outliers
     dof: int  # degrees of freedom
-    joint_noise: JointNoise | None = None  # of joint readings; None if not estimated
+    joint_noise: JointNoise | None = None  # noise of joint readings; None if not estimated
 
     @property
     def chi2(self) -> float:
@@ -124,7 +125,7 @@ class Solution:
 
     @property
     def raw(self) -> FloatArray:
-        """``residual`` at the joint readings, zero where it does not count."""
+        """``residual`` at the joint readings, zero if it does not count."""
         return self.problem.with_noise(None).residual(self.params) * self.used[..., None]
 
     def joint_effect(self) -> tuple[float, float]:
@@ -192,12 +193,12 @@ class Solution:
 
     @property
     def judged_markers(self) -> IntArray:
-        """Markers by which a fit is assessed, evenly: fewer where they have many detections."""
+        """Markers by which a fit is assessed, evenly: fewer if they have many detections."""
         detections = self.problem.detections
         few = even_choice(detections.marker.size, MAX_JUDGED)
         count = np.bincount(detections.marker_of, self.used.sum(axis=0), detections.marker.size)[few].sum()
-        most = int(_MAX_JUDGED_DETECTIONS * few.size / max(count, 1.0))
-        return few[even_choice(few.size, max(most, _MIN_JUDGED))]
+        max_markers_judged = int(_MAX_JUDGED_DETECTIONS * few.size / max(count, 1.0))
+        return few[even_choice(few.size, max(max_markers_judged, _MIN_JUDGED))]
 
     def judged(self) -> "Solution":
         """Select the markers by which a fit is assessed."""
@@ -216,7 +217,7 @@ class Solution:
         )
 
     def errors(self) -> Errors:
-        """Errors of the parameters at a noise of one pixel, factors of (JᵀS⁻¹J)⁺ where the data determine it.
+        """Errors of the parameters at a noise of one pixel, factors of (JᵀS⁻¹J)⁺ if the data determine it.
 
         Factors of J itself keep the weakest direction, which the normal matrix would lose. Each marker is
         eliminated from its own rows; the rest determines the other parameters, which the markers follow
@@ -298,20 +299,20 @@ def inverse_root(R: FloatArray, scale: FloatArray, gauge: FloatArray) -> FloatAr
 class Expected:
     """Expected noise of a fit, px per coordinate."""
 
-    sigma_px: float  # given noise, else that of the epipolar geometry
+    sigma_px: float  # given noise, otherwise as the epipolar geometry shows
     known: bool  # whether it is the true noise of a simulation, so that χ² decides
     origin: str  # its origin: given, stated, views, body, or stated, by one of these
     error: float  # its relative standard error, zero if given
     scale: float | None = None  # true over stated deviations, if the images determine it
     scale_interval: FloatArray | None = None  # (2,) of 95 %
-    shown: str = ""  # who shows it, for messages
-    min_px: float = 0.0  # least noise of pixels where it is estimated, px; zero where it is known
+    evidence: str = ""  # who shows it, for messages
+    min_px: float = 0.0  # minimum pixel noise if it is estimated, px; zero if it is known
 
     @classmethod
     def of(
         cls, epipolar: ImageGeometry, sigma_px: float | None, source: str, stated_px: float | None
     ) -> "Expected":
-        """Given or stated noise, px, which is exact for a ``simulated`` source; else the noise of the rig.
+        """Given or stated noise, px, exact for a ``simulated`` source; otherwise the noise of the rig.
 
         The noise stated in a recording has an unknown common factor. The epipolar residuals of both views,
         independent of the joints, determine it; it is one if its interval contains one.
@@ -329,8 +330,8 @@ class Expected:
             return cls(stated_px, False, origin, _STATED_ERROR, 1.0, interval, min_px=epipolar.min_px)
         scale = epipolar.core.sigma_px / stated_px
         origin = f"{origin}, by {epipolar.origin}"
-        stated_px, shown, min_px = scale * stated_px, epipolar.shown, epipolar.min_px
-        return cls(stated_px, False, origin, _STATED_ERROR, scale, interval, shown, min_px)
+        stated_px, evidence, min_px = scale * stated_px, epipolar.evidence, epipolar.min_px
+        return cls(stated_px, False, origin, _STATED_ERROR, scale, interval, evidence, min_px)
 
     def require_scale(self, view: Sequence[str]) -> None:
         """Refuse stated deviations that are wrong by more than a detector can explain.
@@ -342,7 +343,7 @@ class Expected:
         low, high = self.scale_interval
         if high < _MIN_SCALE or low > _MAX_SCALE:
             raise WorkFailed(
-                f"the stated deviations of the markers are wrong: {self.shown} {self.scale:.3g} "
+                f"the stated deviations of the markers are wrong: {self.evidence} {self.scale:.3g} "
                 f"times the noise of {' and '.join(f'sigma_{name}' for name in view)} (95 %: {low:.3g} to "
                 f"{high:.3g}; {_MIN_SCALE:g} to {_MAX_SCALE:g} times allowed); multiply "
                 f"{'both columns' if len(view) == 2 else 'all of them'} by {self.scale:.3g}, or remove them"
@@ -353,7 +354,7 @@ class Expected:
         return solution.sigma_px / self.sigma_px
 
     def noise_px(self, solution: Solution) -> float:
-        """Noise that scales a covariance, px: the true one of a simulation, else at least the fitted one."""
+        """Noise that scales a covariance, px: true for a simulation, otherwise at least the fitted one."""
         return self.sigma_px if self.known else max(self.sigma_px, solution.sigma_px)
 
     def warns(self, solution: Solution) -> bool:
@@ -369,7 +370,7 @@ class Expected:
         return not self.warns(solution)
 
     def finding(self, code: str, severity: str, solution: Solution) -> Finding:
-        """Finding on the residuals of a fit, beside the noise and its origin."""
+        """Finding on the residuals of a fit, with the noise and its origin."""
         scale = () if self.scale is None else (Finding("stated_scale", amount=self.scale, unit="1"),)
         numbers = solution.sigma_px, math.nan, self.sigma_px, "px"
         return Finding(code, severity, Subject(name=self.origin), *numbers, others=scale)
@@ -413,7 +414,7 @@ def _stall_check(seen: BoolArray, far: float) -> Callable[[FloatArray], bool]:
 def fit_from(problem: LeastSquares, params: Parameters, epipolar: ImageGeometry) -> Solution | None:
     """Fit from initial parameters, by a robust search and ``fit_inliers``; None if it fails.
 
-    Of many detections some markers are searched with; the others are placed by what is found.
+    With many detections the search uses some markers; its result places the others.
     """
     few = _searched_markers(problem.detections, np.isfinite(params.M[:, 0]))
     some, smaller = _of_markers(problem, params, few)
@@ -540,7 +541,7 @@ def _within(
     good = _near(problem, rested, limit)
     many = np.mean((detections.seen & ~good).any(axis=0)) > _MANY and middle <= _RIG * rig_px
     if many:
-        # Slips along both views alike show in this noise and not in that of the rig.
+        # Slips along both views alike show in this noise and not in the noise of the rig.
         sigma = min(sigma, middle if middle > WARN_RATIO * rig_px else min(middle, rig_px))
         doubtful = detections.count_of(detections.seen & ~good) > 0
         M = Tracks(problem, rested).locate(doubtful, sigma)
@@ -577,7 +578,7 @@ def fit_joint_noise(exact: Solution, expected: Expected, given: float | None) ->
     """Refit with noise of joint readings, rad, as given or estimated by maximum likelihood for None.
 
     Returns the exact fit if the images show no such noise, none explains them, or the exact fit predicts
-    left-out poses better: noise of joints also absorbs what is none, as motions of a camera.
+    left-out poses better: noise of joints also absorbs other errors, such as motions of a camera.
     """
     if given == 0.0 or exact.joint_noise is not None:
         return exact
@@ -659,7 +660,7 @@ def left_out_errors(few: Solution) -> FloatArray:
     """Errors (V, N, 2) of images at the joint readings of a pose, by a fit without it to first order, px.
 
     Residuals of detections that count grow by the leverage of their pose: (I − U Uᵀ)⁻¹, with U Uᵀ the
-    projection on what the parameters can do. For few markers.
+    projection on changes by the parameters. For few markers.
     """
     problem, params, detections, used = few.problem, few.params, few.problem.detections, few.used
     raw = problem.with_noise(None).residual(params)
@@ -679,7 +680,8 @@ def left_out_errors(few: Solution) -> FloatArray:
 def solve(search: Search, expected: Expected, nominal: Nominal | None) -> tuple[Solution, Finding | None]:
     """Best fit, and a finding on a given start that did not lead there.
 
-    A start is accepted if its fit leaves the expected noise; else a search from the images alone competes.
+    A start is accepted if its fit leaves the expected noise; otherwise a search from the images alone
+    competes.
 
     Raises InputError if the start is for other joints or markers; WorkFailed if neither succeeds.
     """
@@ -769,7 +771,7 @@ def _same_fit(one: Solution, other: Solution) -> bool:
 
 
 def _explained(solution: Solution) -> BoolArray:
-    """Mask (K,) of poses whose median residual is within ``_SPOILT`` times that of all."""
+    """Mask (K,) of poses whose median residual is within ``_SPOILT`` times the median of all."""
     detections = solution.problem.detections
     poses, group = np.unique(detections.pose_of[np.nonzero(detections.seen)[1]], return_inverse=True)
     distance = np.linalg.norm(solution.residual[detections.seen], axis=1)

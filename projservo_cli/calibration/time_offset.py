@@ -2,8 +2,8 @@
 
 A frame that comes with the joint reading of time t_q shows the joints of t_q − d. Seen less predicted pixels
 for joints at t_q − d are noise; an error of d shows along the image velocity J_q q̇. Each frame estimates its
-own d; their mean and spread are those of the view, so no noise need be known. If frames have time stamps, d
-is the constant offset of their clock from that of the readings.
+own d; their mean and spread hold for the view, so no noise need be known. If frames have time stamps, d
+is the constant offset of their clock from the clock of the readings.
 """
 
 from dataclasses import dataclass, replace
@@ -25,11 +25,11 @@ _EARLIEST = -0.1
 _LATEST = 0.6
 # Step of the search, s.
 _STEP = 0.01
-# Pixel that stands for a marker that the camera does not see, px.
+# Pixel in place of a marker that the camera does not see, px.
 _NOWHERE = 1e4
 # Number of Gauss–Newton steps to the offset of a frame.
 _ROUNDS = 6
-# Maximum distance of the offset of a frame from that of all, s.
+# Maximum distance of the offset of a frame from the common offset, s.
 _FARTHEST = 0.15
 # Half of the step of the finite difference for joint velocities, s.
 _HALF = 1e-3
@@ -93,7 +93,7 @@ class _Frames:
 
     calibration: Calibration
     view: int
-    motions: dict[int, tuple[FloatArray, FloatArray]]  # of each motion, times (k,), s, and joints (k, n)
+    motions: dict[int, tuple[FloatArray, FloatArray]]  # for each motion, times (k,), s, and joints (k, n)
     motion_of: IntArray  # (f,) number of the motion of each frame
     t: FloatArray  # (f,) time by the clock of the readings, s, that the offset applies to
     s: FloatArray  # (f, m, 2) px, markers as in the calibration, NaN if unseen
@@ -124,11 +124,11 @@ class _Frames:
         rows = rows[~np.isin(rows, repeated)]
         t, lag = t_q[rows], t_q[rows] - stamps[rows]
         if len(rows) and np.isfinite(lag).all() and np.ptp(lag) < _LATEST - _EARLIEST:  # both clocks went on
-            t = stamps[rows] + lag.mean()  # by the clock of the readings
+            t = stamps[rows] + lag.mean()  # on the clock of the readings
         return cls(calibration, view, motions, moving[rows], t, s[rows], sigma[rows])
 
     def joints(self, offset: FloatArray | float) -> FloatArray:
-        """Joints (f, n) of each frame at its offset, s: linear between readings, else at rest."""
+        """Joints (f, n) of each frame at its offset, s: linear between readings, otherwise at rest."""
         at, q = self.t - offset, np.empty((len(self.t), len(self.calibration.H_hat_0)))
         for number, (t, q_read) in self.motions.items():
             here = self.motion_of == number
@@ -223,7 +223,7 @@ def _mean(offset: FloatArray, variance: FloatArray, floor: float) -> tuple[float
 
     Random effects: R. C. Paule, J. Mandel, "Consensus values and weighting factors", J. Research NBS 87(5),
     1982; the interval of G. Knapp, J. Hartung, "Improved tests for a random effects meta-regression with a
-    single covariate", Statistics in Medicine 22, 2003. Frames far off the median do not count.
+    single covariate", Statistics in Medicine 22, 2003. Frames far from the median do not count.
     """
     distances = np.abs(offset - np.median(offset))
     spread = float(np.median(distances)) / MAD

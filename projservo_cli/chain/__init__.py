@@ -1,1 +1,1 @@
-"""Stages in their order: what is outdated, made, kept and dropped."""
+"""Stages in their order: outdated, made, kept and dropped results."""

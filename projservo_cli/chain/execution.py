@@ -41,12 +41,12 @@ class Chain:
     """Stages that were asked for, the steps that they take, and their outcome."""
 
     listener: Listener
-    names: Sequence[str]  # of the stages
+    names: Sequence[str]  # names of the stages
     config: Config
     run: Run  # the stored run, with results made since
     wanted: InitVar[Sequence[str]] = ()  # laws instead of ``control.laws``
     _: KW_ONLY
-    force: InitVar[bool] = False  # whether to make the stages even where they are up to date
+    force: InitVar[bool] = False  # whether to make the stages even if they are up to date
     recording: Any = None  # the recording before the calibration, if any
     confirm: bool = False  # whether to ask before the first motion
     in_memory: bool = False  # whether results stay in memory
@@ -67,7 +67,7 @@ class Chain:
         self.robot = Steps(self.config)
         self.steps = steps_for(self.config, self.run, stages, laws=wanted, force=force, recording=why)
         if self.config is not given:
-            note = "the configuration names no calibration.refits, and those of the run stand"
+            note = "the configuration names no calibration.refits, and the refits of the run stay"
             self.steps = [replace(one, note=note) if one.stage == STAGES[0] else one for one in self.steps]
         if self.recording is not None:
             self.steps.insert(0, Step("record", "", "", {}, why))
@@ -92,7 +92,7 @@ class Chain:
         """Refuse to move a robot that no stage asks for, or to start code that only a stored run names.
 
         A run file may come from anybody: its contents are shown and compared, never imported. Classes that
-        are named are imported, so that what cannot be found is known before any work.
+        are named are imported, so that a missing class is known before any work.
 
         named : kinds of code, ``law`` and ``plant``, that the caller names.
         Raises InputError.
@@ -117,7 +117,7 @@ class Chain:
             plugins.find(kind, target)
 
     def replayed(self) -> list[dict[str, Any]]:
-        """Runs of a robot of somebody's that are shown as they were stored: law, plant, and date."""
+        """Runs of a user's robot that are shown as they were stored: law, plant, and date."""
         if self.config.plant.simulated or "servo" in self.names:
             return []
         stored = [
@@ -134,8 +134,8 @@ class Chain:
         found = dict.fromkeys(("law", law) for law in servo if law not in CODES)
         here = self.config.task is not None and self.config.task.start_joints is None
         reads = [one for one in self.steps if one.stage in ("record", "plan") and one.why]
-        looks = any(_drives(step) or here for step in reads)
-        if (servo or looks) and (target := self.config.plant.target):
+        observes = any(_drives(step) or here for step in reads)
+        if (servo or observes) and (target := self.config.plant.target):
             found["plant", target] = None
         return list(found)
 
@@ -162,12 +162,12 @@ class Chain:
         try:
             with self._compiling(), self.robot.connection():
                 self._make_steps(steps)
-        except WorkFailed as error:  # of a robot that may not be at rest
+        except WorkFailed as error:  # the robot may not be at rest
             self._fail(steps[-1], error)
         if self.failed:
             return
         text = stored_yaml(self.config)
-        if self.run.configuration != text:  # overrides are stored also where nothing had to be made
+        if self.run.configuration != text:  # overrides are stored also if nothing had to be made
             self._keep(replace(self.run, configuration=text))
 
     def _make_steps(self, steps: Sequence[Step]) -> None:
@@ -203,7 +203,7 @@ class Chain:
     def _may_move(self, motion: Step, steps: Sequence[Step]) -> bool:
         """Tell where objects of carried goals are, and whether a robot may go there, perhaps after asking.
 
-        Simulated or not: where one has moved too far and nobody is asked, nothing moves.
+        Simulated or not: if one has moved too far and the user is not asked, the robot does not move.
         """
         for step in steps:
             for far in self._far(step) if step.stage == "plan" else ():
@@ -235,7 +235,7 @@ class Chain:
                 yield far
 
     def _fail(self, step: Step, why: str | WorkFailed) -> None:
-        """Note the failure of a step, of a sequence with what stays as it was sent."""
+        """Note the failure of a step, of a sequence with the states that stay as sent."""
         after = self.robot.left_behind(step.part) if step.part and step.stage == "servo" else ""
         self.failed, self.reason = step.name, " ".join(str(why).split()) + after
         self.evidence = why.findings if isinstance(why, WorkFailed) else ()
@@ -256,7 +256,7 @@ class Chain:
         if why := recording_made(self.listener, self.config, self.recording, confirm=self.confirm):
             self.failed, self.reason, self.evidence = "record", str(why), why.findings
             return False
-        if self.run.refuted:  # by what the new recording has taken the place of
+        if self.run.refuted:  # by the recording that the new one has replaced
             save(replace(self.run, refuted=""))
         return True
 
@@ -299,7 +299,7 @@ class Chain:
     def findings(self, of_calibration: Mapping[str, Any]) -> Iterator[_Shortfall]:
         """Yield the failures of the chain, and whether they end the call with exit code 1.
 
-        of_calibration : whether joint types were assumed, and what came of suggestions.
+        of_calibration : whether joint types were assumed, and the results of suggestions.
         """
         if self.failed:
             yield from self._of_runs()
@@ -316,7 +316,7 @@ class Chain:
         if of_calibration.get("suggestions") == []:
             yield _Shortfall(f"calibrate: {of_calibration['suggestions_reason']}", fatal=True)
         yield from self._of_runs()
-        # Other profiles are those of the paper, of which the margins are only measured.
+        # Other profiles follow the paper; their margins are only measured.
         for step in self.steps:
             plan = results[step.name].records[""] if step.stage == "plan" else None
             if plan is not None and plan.profile in ("constrained", "joint_space") and not plan.feasible:
@@ -376,7 +376,7 @@ class Chain:
             raise KeyboardInterrupt
 
     def _would_lose(self, step: Step, result: Any, after: Sequence[str]) -> str:
-        """Say which runs of a robot of somebody's a plan that cannot be followed would drop."""
+        """Say which runs of the user's robot a plan that cannot be followed would drop."""
         driven = [name for name in after if name.startswith(SERVO)]
         if step.stage != "plan" or "servo" in self.names or self.config.plant.simulated or not driven:
             return ""
@@ -434,7 +434,7 @@ class Chain:
         return (report.run(inputs, self.reported(run), run.path.parent, progress=progress),)
 
     def _follow(self, name: str, plan: Plan) -> None:
-        """Take a plan from where the arm stands in place of that of a name, unless it is that."""
+        """Replace the plan of a name by a plan from the present joints, unless it is the same."""
         stored = self.run.results[name]
         if plan is not stored.records[""]:
             taken = replace(stored, records={"": plan})
@@ -450,7 +450,7 @@ class Chain:
 
 
 def _with_refits(config: Config, run: Run) -> Config:
-    """The configuration with the refits of a run, which belong to its table, where it names none itself."""
+    """The configuration with the refits of a run, which belong to its table, if it names none itself."""
     stored = run.results.get("calibrate")
     if stored is None or config.calibration.refits or run.calibration.refits is None:
         return config
@@ -478,7 +478,7 @@ def require_simulated(config: Config) -> None:
 
 
 def _bounded(inputs: PlanInputs, run: Run) -> PlanInputs:
-    """Return the inputs of a plan with the border of images of an unknown size: what the recording shows."""
+    """Return the inputs of a plan with the border of images of an unknown size, as the recording shows."""
     if inputs.image_size is not None:
         return inputs
     seen = np.ceil(np.nanmax(run.observation.images, axis=(0, 2)) + 0.5).astype(int).tolist()

@@ -1,6 +1,6 @@
-"""Outdated results: the dependencies of stages, and what must be made first.
+"""Outdated results: the dependencies of stages, and the stages to make first.
 
-Every result carries a key: a hash of what its stage is given, and of the keys of the results that it is made
+Every result carries a key: a hash of its stage's inputs, and of the keys of the results that it is made
 from. Keys follow from the configuration and the files that it names, so the work is known before
 anything is done.
 """
@@ -29,7 +29,7 @@ from projservo_cli.result_hashes import key_of
 from projservo_cli.settings.task import TaskStep
 from projservo_cli.store.run_file import SERVO, Result, Run
 
-# The stages in their order, and what makes the record that each is given.
+# The stages in their order, and the maker of the record that each gets.
 _INPUTS: dict[str, Callable[[Config, Files | None], Any]] = {
     "calibrate": calibration_inputs,
     "plan": plan_inputs,
@@ -45,14 +45,14 @@ class Step:
     """One result that is needed."""
 
     stage: str  # name of the stage
-    law: str  # name of the run of a law for ``servo``, such as ``exact`` or ``exact_track``, else empty
+    law: str  # name of the run of a law for ``servo``, such as ``exact`` or ``exact_track``, otherwise empty
     key: str  # future key of the result
-    inputs: Mapping[str, str]  # files read and their hashes, and the hash of the source of a law of one's own
-    why: str = ""  # why it has to be made; empty where the stored one is up to date
-    note: str = ""  # what changed that does not outdate it, in words
+    inputs: Mapping[str, str]  # files read and their hashes, and the hash of the source of a user's law
+    why: str = ""  # why it has to be made; empty if the stored one is up to date
+    note: str = ""  # changes that do not outdate it, in words
     unkeyed: bool = False  # whether its law has no source, so that it is never up to date
-    record: Any = None  # inputs of the stage; None where they cannot be made
-    part: str = ""  # name of the step of a sequence, else empty
+    record: Any = None  # inputs of the stage; None if they cannot be made
+    part: str = ""  # name of the step of a sequence, otherwise empty
 
     @property
     def name(self) -> str:
@@ -78,14 +78,15 @@ def steps_for(
 
     run : the stored run, which may be empty.
     laws : instead of ``control.laws``.
-    force : make the named stages even where they are up to date, and replace a recorded calibration.
-    recording : why the table has to be recorded first; keys of what rests on it are not known until then.
+    force : make the named stages even if they are up to date, and replace a recorded calibration.
+    recording : why the table has to be recorded first; keys of dependent results are unknown until then.
     """
     stages = STAGES[: max(map(STAGES.index, named)) + 1]
     inputs = _Inputs() if recording else _inputs(config, run, stages)
 
     def names_of(asked: Sequence[str]) -> Sequence[str]:
-        if config.steps and run.traces and not (laws or "servo" in named):  # that of the call that drove it
+        # the laws of the call that drove it
+        if config.steps and run.traces and not (laws or "servo" in named):
             return list(dict.fromkeys(name.split("/")[-1] for name in run.traces))
         return run_names(asked, config.control.mode)
 
@@ -104,11 +105,11 @@ def steps_for(
             why = _reason(step, run, force and step.stage in named, remade)
             if step.stage == "servo" and own:
                 why = why or "a real robot moves in every call"
-            looks = step.stage == "plan" and step.record is not None and step.record.carriers
-            if looks and {"plan", "servo"} & {*named} and not config.plant.simulated:
+            observes = step.stage == "plan" and step.record is not None and step.record.carriers
+            if observes and {"plan", "servo"} & {*named} and not config.plant.simulated:
                 why = why or "its object may lie elsewhere now"
             if step.stage == "plan" and own and config.task and config.task.start_joints is None:
-                why = why or "the arm may stand elsewhere"
+                why = why or "the arm may be elsewhere"
             steps.append(replace(step, why=why))
         if any(step.why for step in steps if step.part and step.stage == "servo"):
             amid = "a sequence is not resumed amid"
@@ -120,7 +121,7 @@ def steps_for(
 
     steps = planned(stages, laws or config.control.laws)
     if not config.has_task and set(named) <= {"calibrate", "report"}:
-        # Of a robot without a model a report shows the runs that are up to date, and needs no others.
+        # For a robot without a model, a report shows the runs that are up to date, and needs no others.
         lacking = {law_and_mode(step.law)[0] for step in steps if step.law and step.why}
         made = {law_and_mode(step.law)[0]: None for step in steps if step.law}.keys() - lacking
         kept = [law for law in laws or config.control.laws if law in made]
@@ -137,8 +138,8 @@ def steps_for(
 class _Read(NamedTuple):
     """Files of a result, in addition to the configuration and its predecessors."""
 
-    inputs: Mapping[str, str]  # files and their hashes, and hashes of sources of laws and robots of one's own
-    hashed: Mapping[str, str] = {}  # those of them that the key is of
+    inputs: Mapping[str, str]  # files and their hashes, and hashes of sources of the user's laws and robots
+    hashed: Mapping[str, str] = {}  # the subset in the key
     note: str = ""  # changes that do not outdate the result, in words
     unkeyed: bool = False  # whether the law is of a notebook or a script, whose source is in no module
 
@@ -146,7 +147,7 @@ class _Read(NamedTuple):
 def _sources(names: Sequence[str], config: Config, run: Run) -> dict[str, _Read]:
     """Return the files of each run of a law, by its name: sources of plug-in law and robot.
 
-    Where the source of a law is gone since, the stored hash stands. Another source of a robot outdates
+    If the source of a law is gone since, the stored hash holds. Another source of a robot outdates
     nothing: its motion cannot be repeated.
     """
     plant = config.plant.target
@@ -175,14 +176,14 @@ def _sources(names: Sequence[str], config: Config, run: Run) -> dict[str, _Read]
 class _Inputs(NamedTuple):
     """Inputs of stages."""
 
-    records: Mapping[str, Any] = {}  # by stage and step of a sequence; none where keys are missing
+    records: Mapping[str, Any] = {}  # by stage and step of a sequence; none if keys are missing
     files: Mapping[str, str] = {}  # hashes of the input files, by name
 
 
 def _inputs(config: Config, run: Run, stages: Sequence[str]) -> _Inputs:
     """Return the inputs of each stage that the configuration determines; making others reports missing keys.
 
-    An InputError where a file cannot be read. Where a file is gone since, its stored hash stands.
+    An InputError if a file cannot be read. If a file is gone since, its stored hash holds.
     """
     stored = run.results["calibrate"].inputs if "calibrate" in run.results else {}
     gone = {
@@ -202,14 +203,14 @@ def _inputs(config: Config, run: Run, stages: Sequence[str]) -> _Inputs:
 
 
 def _parts_of(stage: str, steps: Mapping[str, TaskStep]) -> dict[str, TaskStep | None]:
-    """Return the steps of a sequence that a stage makes results of; of no name where it makes one alone."""
+    """Return the steps of a sequence that a stage makes results of; of no name if it makes one alone."""
     if not steps or stage not in ("plan", "servo"):
         return {"": None}
     return {name: step for name, step in steps.items() if step.moves or stage == "servo"}
 
 
 def inputs_of(stage: str, config: Config) -> Any:
-    """The record that a stage is given; an InputError where a part of the configuration is missing."""
+    """The record that a stage is given; an InputError if a part of the configuration is missing."""
     return _INPUTS[stage](config, None)
 
 
@@ -219,7 +220,7 @@ def key_of_calibration(record: Any) -> str:
 
 
 def _key(own: str, before: Sequence[str], law: str, source: Mapping[str, str]) -> str:
-    """Key of a result, by that of its inputs, those of the results before, and the hashes of its law."""
+    """Key of a result, by the keys of its inputs and of the results before, and the hashes of its law."""
     return own and key_of(own, before=list(before), law=law, source=dict(source))
 
 
@@ -268,7 +269,7 @@ def _missing(run: Run) -> bool:
 
 
 def result_of(step: Step, config: Config, *made: Any) -> Result:
-    """The result that consists of what its stage made."""
+    """The result from the records of its stage."""
     labels = ("observation", "calibration", "cross_validation") if step.stage == "calibrate" else ("",)
     labels = ("action",) if step.part and step.stage == "servo" and not step.law else labels
     records = {label: record for label, record in zip(labels, made, strict=True) if record is not None}

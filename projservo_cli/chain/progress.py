@@ -8,7 +8,7 @@ from typing import Any, Self
 
 # Period at which the clock of a bar advances, s.
 TICK_S = 0.5
-# Period of the lines that tell how far work is where there is no terminal, s.
+# Period of the lines that report progress if there is no terminal, s.
 _LINE_S = 60.0
 
 
@@ -37,7 +37,7 @@ class _Bar:
             self.close()
 
     def _line(self, what: str, done: int, total: int) -> None:
-        """Print how far the work of ``what`` is, once a minute from when it began."""
+        """Print the progress of ``what``, once a minute from when it began."""
         now = time.monotonic()
         if what != self._what:
             self._what, self._told = what, now
@@ -95,4 +95,4 @@ class Listener:
             self._progress(what, done, total)
 
     def confirm(self, command: str, plant: Any) -> None:
-        """Agree to the first motion of a plant; raises KeyboardInterrupt where the answer is not yes."""
+        """Agree to the first motion of a plant; raises KeyboardInterrupt if the answer is not yes."""

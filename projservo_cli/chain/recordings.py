@@ -1,4 +1,4 @@
-"""The recording before a calibration: what is pending of its table, and its making."""
+"""The recording before a calibration: the pending part of its table, and its making."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -40,11 +40,11 @@ def pending_recording(config: Config, run: Run, motions: JointList | None, *, fo
     if not contradicted or before.get("table_sha256") != digest(path.read_bytes()):
         return found
     begun = new_recording(inputs, path, motions=motions, force=True)
-    return replace(begun, why=f"what is there was contradicted: {run.refuted}")
+    return replace(begun, why=f"the recording was contradicted: {run.refuted}")
 
 
 def recording_made(listener: Listener, config: Config, recording: Any, *, confirm: bool) -> WorkFailed | None:
-    """Record the pending poses, and tell how far it is on an interrupt; return a failure."""
+    """Record the pending poses, and report its progress on an interrupt; return a failure."""
     from projservo_cli.stages.record import record_poses
 
     if recording.pending and confirm:

@@ -1,4 +1,4 @@
-"""Steps of a task on a robot: where the arm stands before each, what it is told, and what is left behind."""
+"""Steps of a task on a robot: the arm's joints before each, its commands, and remaining states."""
 
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
@@ -27,7 +27,7 @@ class Steps:
     session: "Session | None" = None  # while they are made
 
     def connection(self) -> AbstractContextManager[Any]:
-        """Return the connection that steps share, or that says where the arm stands; else nothing."""
+        """Return the connection that steps share, or that reads the joints of the arm; otherwise None."""
         task = self.config.task
         if task is None or (not task.steps and task.start_joints is not None):
             return nullcontext()
@@ -42,7 +42,7 @@ class Steps:
         return [name for name, step in self.config.steps.items() if step.moves]
 
     def opened(self, c: Calibration) -> FloatArray:
-        """Open the robot of somebody's, unless it is, and return where it stands (n,), rad or m."""
+        """Open the user's robot, unless it is open, and return its joints (n,), rad or m."""
         from projservo_cli.stages.worlds.calibrated import observed_numbers
         from projservo_cli.stages.worlds.external_robot import opened_robot
 
@@ -52,21 +52,21 @@ class Steps:
         joints = inputs.plan.joints.joints(c.joint_types, c)
         opened_robot(self.session, inputs.contract.driven, joints, observed_numbers(inputs.plan, c), c.view)
         actions = {name for step in self.config.steps.values() for name in step.act or ()}
-        self.session.require_acts(actions)  # which refuses what could not act later
+        self.session.require_acts(actions)  # refuses actions that the robot lacks
         return self.session.reading()
 
     def joints_before(self, c: Calibration) -> FloatArray:
-        """Joints (n,) where the arm stands before anything moves it, rad or m."""
+        """Joints (n,) of the arm before any motion, rad or m."""
         if not self.config.plant.simulated:
             return self.opened(c)
         if self.config.calibration.reference is None:
             raise InputError(
-                "task.start: current: a simulated robot stands at calibration.reference: set it, or joints"
+                "task.start: current: a simulated robot starts at calibration.reference: set it, or joints"
             )
         return self.config.calibration.reference.values(self.config.joint_types or "")
 
     def expected(self, part: str, run: Run) -> FloatArray | None:
-        """Return where the arm will stand before a step, by the plan before; None for a given start."""
+        """Return the joints of the arm before a step, by the plan before; None for a given start."""
         task = self.config.task
         if task is None:
             return None
@@ -77,11 +77,11 @@ class Steps:
         end: FloatArray = run.at_step(before).plan.q[-1]
         if not np.isfinite(end).all():
             why = f"since no joints follow the plan of {before}"
-            raise WorkFailed(f"where the arm then stands is open, {why}")
+            raise WorkFailed(f"the joints of the arm then are open, {why}")
         return end
 
     def from_here(self, step: Step, run: Run, inputs: ServoInputs, plan: Plan) -> tuple[ServoInputs, Plan]:
-        """Return the inputs of a step from where the arm stands, and a plan from there."""
+        """Return the inputs of a step from the present joints, and a plan from there."""
         from projservo_cli.stages import plan as planning
 
         k, q = self.motions.index(step.part), plan.q_start
@@ -109,7 +109,7 @@ class Steps:
         return Action("act", said + ", which holds nothing" * nothing, seconds)
 
     def left_behind(self, part: str) -> str:
-        """Say what stays as it was sent, and which steps of the sequence were not begun."""
+        """Report the states that stay as sent, and which steps of the sequence were not begun."""
         names = list(self.config.steps)
         rest = names[names.index(part) + 1 :]
         kept = "" if self.session is None else ", ".join(lines(self.session.kept))

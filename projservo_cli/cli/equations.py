@@ -8,11 +8,11 @@ import yaml
 
 @dataclass(frozen=True)
 class _Entry:
-    """One equation, or a statement of a section where the number starts with ``§``."""
+    """One equation, or a statement of a section if the number starts with ``§``."""
 
     number: str
     title: str
-    functions: tuple[str, ...]  # dotted names of what implements it: listing them imports nothing
+    functions: tuple[str, ...]  # dotted names of its implementations: listing them imports nothing
     tests: tuple[str, ...]  # ``file::name`` of those that show it holds
     erratum: str  # the misprint and its correction; may be empty
 

@@ -98,9 +98,9 @@ def _doctor(
 
     With -c it opens robot and cameras, moves nothing, and writes a table and a page with both pictures: frame
     rates, exposure, sharpness, tags, joints, limits, each finding with its remedy. With a calibration in RUN,
-    by default that of the configuration's name in results, it says whether images still agree. Where one
+    by default the run of the configuration's name in results, it says whether images still agree. If one
     camera moved, it writes refit_poses.csv, the poses to fit it again from. --move measures latency,
-    hysteresis, sag, and whether tags sit fast. Exit code 1 where a recording would fail.
+    hysteresis, sag, and whether tags sit fast. Exit code 1 if a recording would fail.
     """
     if config is not None:
         from projservo_cli.cli.tags_doctor import doctor
@@ -109,7 +109,7 @@ def _doctor(
         return doctor(console, run, config, options, output or Path("preflight.html"))
     if run is not None or sets or output is not None or move or watch:
         raise click.UsageError("doctor checks a robot with -c alone: projservo doctor -c arm.yaml")
-    packages, extras = _requirements()
+    packages, optional = _requirements()
     missing = [name for name, version in packages.items() if version is None]
     folder = Path("results").absolute()
     there = next(path for path in (folder, *folder.parents) if path.exists())
@@ -122,7 +122,7 @@ def _doctor(
         "processors": os.cpu_count(),
         "packages": packages,
         "missing": missing,
-        "extras": {name: sorted(lacking) for name, lacking in extras.items()},
+        "extras": {name: sorted(lacking) for name, lacking in optional.items()},
         "kernels": None,
         "results": {"folder": folder, "writable": writable},
     }
@@ -136,7 +136,7 @@ def _doctor(
 
 
 def _requirements() -> tuple[dict[str, str | None], dict[str, list[str]]]:
-    """Versions of the packages every run needs, None where one is missing; and what each extra lacks."""
+    """Versions of required packages, None if missing; and the missing packages of each extra."""
     import importlib.metadata
     import re
 
@@ -145,7 +145,7 @@ def _requirements() -> tuple[dict[str, str | None], dict[str, list[str]]]:
     except importlib.metadata.PackageNotFoundError:  # run from sources that were never installed
         needed = []
     packages: dict[str, str | None] = {}
-    extras: dict[str, list[str]] = {}
+    optional: dict[str, list[str]] = {}
     for text in needed:
         (name,) = re.findall(r"^[\w.-]+", text)
         extra = re.search(r"extra\s*==\s*['\"]([\w.-]+)['\"]", text)
@@ -153,8 +153,8 @@ def _requirements() -> tuple[dict[str, str | None], dict[str, list[str]]]:
         if extra is None:
             packages[name] = version
         else:
-            extras.setdefault(extra[1], []).extend([name] if version is None else [])
-    return packages, extras
+            optional.setdefault(extra[1], []).extend([name] if version is None else [])
+    return packages, optional
 
 
 def _found(value: dict[str, Any]) -> Iterator[str]:
@@ -194,7 +194,7 @@ def _bench(console: Console, *, config: str | None, sets: tuple[str, ...]) -> No
     from projservo_cli.config.inputs import servo_inputs
     from projservo_cli.stages.bench import Case, timings
 
-    console.say("compiling kernels where they are not in the cache, then measuring: half a minute")
+    console.say("compiling kernels if they are not in the cache, then measuring: half a minute")
     settings = option.configured(config, {"sets": sets})
     result = timings(Case(servo_inputs(settings)))
     collected = provenance.collect(seed=settings.seed)

@@ -28,13 +28,13 @@ _MAX_BYTES = 1_000_000  # maximum size of a configuration
     metavar="JOINT",
     type=int,
     multiple=True,
-    help="Let the servo of a joint store an offset where its range crosses the end of its turn. Repeatable.",
+    help="Let the servo of a joint store an offset if its range crosses the end of its turn. Repeatable.",
 )
 @option.explained
 def _limits(console: Console, *, config: str, shift: tuple[int, ...]) -> None:
     """Find joint limits by hand and write them.
 
-    Lets go of an arm of bus servos. Somebody moves each joint through all that is allowed, ten seconds a
+    Lets go of an arm of bus servos. The user moves each joint through its allowed range, ten seconds per
     joint, and presses Enter. The limits go into the file under robot.limits; its comments and other keys
     stay. Nothing is ever moved beyond them.
     """
@@ -42,9 +42,9 @@ def _limits(console: Console, *, config: str, shift: tuple[int, ...]) -> None:
     from projservo_cli.hardware import taught_limits
     from projservo_cli.store.files_and_locks import text_of, write_whole
 
-    path = Path(config).resolve()  # the file itself where the name is a link
+    path = Path(config).resolve()  # the file itself if the name is a link
     text = text_of(Path(config), "a configuration", _MAX_BYTES)
-    with_limits(text, [], config)  # before somebody moves the arm for it
+    with_limits(text, [], config)  # before the user moves the arm for it
     with _servos(console, config, text) as servos:
         taught_limits.require_known(shift, len(servos.ids))
         console.wait("take hold of the arm: it will be released")
@@ -62,7 +62,7 @@ def _limits(console: Console, *, config: str, shift: tuple[int, ...]) -> None:
 
 
 def _require_limits(text: str, limits_deg: list[tuple[float, float]], config: str) -> None:
-    """Raise InputError where an edited configuration does not have these limits, with what to write."""
+    """Raise InputError if an edited configuration does not have these limits, with the lines to write."""
     from projservo_cli.config import load_config
     from projservo_cli.records import InputError
 
@@ -86,7 +86,7 @@ def _require_limits(text: str, limits_deg: list[tuple[float, float]], config: st
 def _release(console: Console, *, config: str) -> None:
     """Let go of an arm of bus servos.
 
-    Switches the torque of all its servos off, the gripper's too. The arm falls where nobody holds it.
+    Switches the torque of all its servos off, the gripper's too. The arm falls unless someone holds it.
     """
     from projservo_cli.findings import REFUSES, Finding
     from projservo_cli.messages import failed
@@ -94,7 +94,7 @@ def _release(console: Console, *, config: str) -> None:
 
     text = text_of(Path(config), "a configuration", _MAX_BYTES)
     with _servos(console, config, text, whole=False) as servos:
-        console.wait("take hold of the arm, and of what its gripper holds: they will be released")
+        console.wait("take hold of the arm, and of the object in its gripper: they will be released")
         servos.release(all_of_them=True)
         lost = tuple(map(servos.finding, sorted(servos.lost)))
     console.report({"released": servos.alive}, ["release: done" if not lost else "release: not of all"])
@@ -126,13 +126,13 @@ def _servos(console: Console, config: str, text: str, *, whole: bool = True) -> 
 
 
 def _entered(console: Console, what: str) -> Callable[[], bool]:
-    """Ask the user to act; return a function that tells whether Enter came since."""
+    """Ask the user to act; return a function that reports whether Enter came since."""
     came, obstacles = threading.Event(), list[BaseException]()
 
     def ask() -> None:
         try:
             console.wait(what)
-        except BaseException as error:  # raised where somebody waits for Enter
+        except BaseException as error:  # raised where the program waits for Enter
             obstacles.append(error)
         came.set()
 

@@ -42,7 +42,7 @@ NUMBER = _Finite()
 RESULTS = Path("results")
 _UNNAMED = "projservo: configuration"  # whether a call takes that which is shipped, as it names none
 _SIZE = re.compile(r"(?:([^=]*)=)?\s*(\d+)\s*[xX]\s*(\d+)\s*")
-_KEYS = {  # that options stand for
+_KEYS = {  # keys that options set
     "data": "data.table",
     "readings": "data.readings",
     "mount": "data.mount",
@@ -77,10 +77,10 @@ speed_scale = click.option(
 
 
 def _with_terminal(context: click.Context, parameter: click.Parameter, value: bool) -> bool:
-    """Refuse an option that asks somebody where nobody can answer."""
+    """Refuse an option that asks a question without a terminal."""
     del context
     if value and not sys.stdin.isatty():
-        what = "standard input is no terminal, so nobody can be asked; leave it out"
+        what = "standard input is no terminal, so no question can be asked; leave it out"
         raise click.UsageError(f"{parameter.opts[0]}: {what}")
     return value
 
@@ -114,7 +114,7 @@ def require_new(path: Path, *, force: bool) -> None:
 
 
 def one_run(command: str, run: Path | None, output: Path | None) -> Path | None:
-    """The run that is named, as an argument or with ``-o``; None where none is."""
+    """The run that is named, as an argument or with ``-o``; None if none is."""
     if run is not None and output is not None:
         raise click.UsageError(f"{command} takes one run, as an argument or with -o")
     return run or output
@@ -123,19 +123,19 @@ def one_run(command: str, run: Path | None, output: Path | None) -> Path | None:
 def configured(
     config: str | None, options: Mapping[str, Any], run: Path | None = None, *, teaching: bool = False
 ) -> "Config":
-    """The configuration in a file, else in a run, else that which is shipped, with what options say.
+    """The configuration of a file, a run, or else the shipped one, with the options applied.
 
     teaching : goal and start may name files that are still to be taught.
-    Raises UsageError where a robot is named by the run alone, which starts no code.
+    Raises UsageError if a robot is named by the run alone, which starts no code.
     """
     from projservo_cli.config import load_config, shipped
     from projservo_cli.store.run_file import stored
 
-    held = None if config or run is None else stored(run)
-    if held is None or not held.configuration:
+    of_run = None if config or run is None else stored(run)
+    if of_run is None or not of_run.configuration:
         click.get_current_context().meta[_UNNAMED] = config is None
         return load_config(config or shipped("paper"), overrides(options), teaching=teaching)
-    found = load_config(held.path, overrides(options), text=held.configuration)
+    found = load_config(of_run.path, overrides(options), text=of_run.configuration)
     if not found.plant.simulated:
         raise click.UsageError(
             f"plant {found.plant.use} is named by the stored run alone, which starts no code: give the "
@@ -145,13 +145,13 @@ def configured(
 
 
 def say_unnamed(console: Console) -> None:
-    """Say, once, that a call names no configuration, where it takes that which is shipped."""
+    """Say, once, that a call names no configuration, if it takes that which is shipped."""
     if click.get_current_context().meta.pop(_UNNAMED, False):
         console.say("configuration: paper.yaml, as shipped; projservo init writes yours (-c FILE)")
 
 
 def calibrated_run(run: Path | None, config: "Config") -> "Run | None":
-    """The run that is named, by default that of the configuration's name; None without a calibration."""
+    """The run that is named, by default of the configuration's name; None without a calibration."""
     from projservo_cli.store.run_file import stored
 
     found = stored(run or RESULTS / config.name)
@@ -161,7 +161,7 @@ def calibrated_run(run: Path | None, config: "Config") -> "Run | None":
 
 
 def overrides(options: Mapping[str, Any]) -> list["Override"]:
-    """Options that stand for keys, then ``--set``, then ``--goal`` and ``--speed-scale``."""
+    """Options that set keys, then ``--set``, then ``--goal`` and ``--speed-scale``."""
     from projservo_cli.config import Override, to_goals
 
     found = []
@@ -187,7 +187,7 @@ def overrides(options: Mapping[str, Any]) -> list["Override"]:
         values: Any = [one for _, one in sizes]
         values = dict(zip(names, values, strict=True)) if names else values if len(values) > 1 else values[0]
         found.append(Override(flag, "data.image_size_px", values))
-    found += map(Override.parse, options["sets"])  # which would undo what follows
+    found += map(Override.parse, options["sets"])  # undoes earlier overrides of its key
     if goals := options.get("goals"):
         found += to_goals(f"--goal {' --goal '.join(goals)}", goals)
     if (scale := options.get("speed_scale")) is not None:

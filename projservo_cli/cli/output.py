@@ -52,10 +52,10 @@ class Console(Listener):
         self.quiet = quiet
         self.verbose = verbose
         self.as_json = as_json
-        self._data = sys.stdout  # while a command works, what others print goes elsewhere
+        self._data = sys.stdout  # output of other code during a command goes elsewhere
 
     def report(self, value: dict[str, Any], lines: Iterable[str]) -> None:
-        """Data on standard output: one object of strict JSON in UTF-8, whatever the locale, or in words."""
+        """Data on standard output: one object of strict JSON in UTF-8 in any locale, or words."""
         if self.as_json:
             from projservo_cli.store.display import plain
 
@@ -78,14 +78,14 @@ class Console(Listener):
             self.say(text)
 
     def confirm(self, command: str, plant: Any) -> None:
-        """Ask before the first motion of a ``plant``; a KeyboardInterrupt where the answer is not yes."""
+        """Ask before the first motion of a ``plant``; a KeyboardInterrupt if the answer is not yes."""
         driven = plant.use or "the simulated robot"
         if not self.agreed(f"{command} will move {driven}, speeds times {plant.speed_scale:g}. Go?"):
             self.say("not confirmed: nothing was moved")
             raise KeyboardInterrupt
 
     def agreed(self, question: str) -> bool:
-        """Ask somebody at the terminal, and return whether the answer is yes."""
+        """Ask the user at the terminal, and return whether the answer is yes."""
         self._bar.close()
         try:
             return click.confirm(question, err=True)
@@ -93,7 +93,7 @@ class Console(Listener):
             return False
 
     def wait(self, text: str) -> None:
-        """Ask the user to act, and wait for the Enter key. Raises InputError where there is no terminal."""
+        """Ask the user to act, and wait for the Enter key. Raises InputError if there is no terminal."""
         self._bar.close()
         click.echo(wrapped(f"{text}, then press Enter"), err=True)
         if sys.stdin.readline() == "":
@@ -176,7 +176,7 @@ def _in_detail(value: dict[str, Any]) -> Iterator[str]:
     for text in value["advice"]:
         yield wrapped(f"advice: {text}", "  ")
     yield (
-        f"  residual {value['rms_px']:.4g} px a point, sigma {value['sigma_px']:.4g} px a coordinate, "
+        f"  residual {value['rms_px']:.4g} px per point, sigma {value['sigma_px']:.4g} px per coordinate, "
         f"chi2/dof {value['chi2_per_dof']:.4g}, {value['seconds']:.1f} s"
     )
     if value["sigma_view_px"] is not None:
@@ -231,7 +231,7 @@ _NO_LIMITS = (
     "no joint limits are known here: give them with -c or robot.limits, or leave out what your robot cannot "
     "reach"
 )
-_EXAMPLES = 3  # of each kind of rejected observations
+_EXAMPLES = 3  # number of examples for each kind of rejected observations
 
 
 def _rejected(value: dict[str, Any]) -> Iterator[str]:
@@ -307,7 +307,9 @@ def _of_suggestions(value: dict[str, Any]) -> Iterator[str]:
     yield f"  poses to add, as offsets from a recorded one; predicted error {now:.3g} px now"
     yield f"  {'from pose':>9}{names}{'then px':>9}"
     for row in rows:
-        way = (math.degrees(d) if turns else 1e3 * d for d, turns in zip(row["delta"], revolute, strict=True))
+        steps = (
+            math.degrees(d) if turns else 1e3 * d for d, turns in zip(row["delta"], revolute, strict=True)
+        )
         then = math.sqrt(row["variance_after"])
         yield f"  {row['from_pose']:>9}" + "".join(f"{d:>+9.1f}" for d in way) + f"{then:>9.3g}"
     if value["readings"] == "flange":
@@ -403,7 +405,7 @@ def _of_laws(value: dict[str, Any], _: bool) -> Iterator[str]:
 
 
 def _incidence(row: dict[str, Any]) -> str:
-    """Name of an incidence, within which error it is met, and by how much its images are off."""
+    """Name of an incidence, the error within which it is met, and the error of its images."""
     parts = ((row["error_mm"], "mm"), (row["error_deg"], "deg"))
     said = [f"{number:.2g} {unit}" for number, unit in parts if number is not None and number == number]
     within = f"within {', '.join(said)}, " if said else ""
@@ -415,11 +417,11 @@ def _of_report(value: dict[str, Any], detailed: bool) -> Iterator[str]:
     explained = [claim for claim in claims if detailed or claim["holds"] is False]
     found = [claim["holds"] for claim in claims]
     judged, left = len(found) - found.count(None), found.count(None)
-    held = f"; {found.count(True)} of {judged} judged claims hold" if claims else ""
-    held += f", {left} not judged" if left else ""
+    verdict_text = f"; {found.count(True)} of {judged} judged claims hold" if claims else ""
+    verdict_text += f", {left} not judged" if left else ""
     but = "; it does not hold that" if explained and not detailed else ""
     count = len(value["figures"])
-    yield wrapped(f"report: {count} file{'s' * (count != 1)} of figures{held}{but}")
+    yield wrapped(f"report: {count} file{'s' * (count != 1)} of figures{verdict_text}{but}")
     words = {True: "holds", False: "does not hold", None: "not judged"}
     for claim in explained:
         if detailed:
@@ -442,7 +444,7 @@ def _number(value: float | None) -> str:
 
 
 def _of_sweep(found: dict[str, Any], _: bool) -> Iterator[str]:
-    """The table of cells, and that of pairs of laws on the same tasks."""
+    """The table of cells, and the table of pairs of laws on the same tasks."""
     yield (
         f"report: {found['runs']} of {found['total']} runs; shares in %, 95 % interval; medians of successes"
     )

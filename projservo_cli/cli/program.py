@@ -40,7 +40,7 @@ class _Stage(click.Command):
 
 
 class _Group(click.Group):
-    """A group whose stages chain, and in which options stand anywhere and hold for the whole call.
+    """A group whose stages chain, and in which options may come anywhere and hold for the whole call.
 
     ``context.obj`` are the names of the commands that are called: of one, or of the stages of a chain,
     which are called as one command that takes the options of them all.
@@ -150,7 +150,7 @@ class _Group(click.Group):
                 hint = f"did you mean {close[0]}? " if close else ""
                 raise click.UsageError(f"no command {word!r}; {hint}commands: {', '.join(self.commands)}")
             if word not in self.stages:
-                raise click.UsageError(f"{word} stands alone; it does not chain with {first}")
+                raise click.UsageError(f"{word} runs alone; it does not chain with {first}")
         return [name for name in self.stages if name in words], []
 
     def main(self, args: Sequence[str] | None = None, *_: Any, **__: Any) -> NoReturn:
@@ -167,14 +167,14 @@ class _Group(click.Group):
 main = _Group(
     "projservo",
     help="Uncalibrated stereo visual servoing in projective space. The stages record, calibrate, plan, "
-    "servo and report chain in one call; each first makes its missing inputs. Options may stand anywhere.",
+    "servo and report chain in one call; each first makes its missing inputs. Options may come anywhere.",
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 80},
 )
 click.version_option(__version__, message="projservo %(version)s")(main)
 
 
 def _flag(option: click.Parameter) -> str:
-    """The long form of an option; click gives those of help in no order."""
+    """The long form of an option; click gives the help options in no order."""
     return max(option.opts, key=len)
 
 
@@ -248,7 +248,7 @@ def _abandon_threads(ended: Sequence[int]) -> None:
 
 
 def _raise_again(lost: "sys.UnraisableHookArgs") -> None:
-    """Interrupt a moment later where Ctrl-C came amid what cannot raise, such as the end of an object."""
+    """Interrupt a moment later if Ctrl-C came in code that cannot raise, such as a finalizer."""
     if not issubclass(lost.exc_type, KeyboardInterrupt):
         sys.__unraisablehook__(lost)
         return

@@ -126,7 +126,7 @@ _KINDS = {"opencv": "cameras.yaml", "urdf": "robot.urdf", "json": "metric.json",
     type=click.Choice(["own", "model"]),
     default="own",
     show_default=True,
-    help="Base and tool frame: by the joints and the face, or those of --nominal.",
+    help="Base and tool frame: by the joints and the face, or as --nominal.",
 )
 @click.option("--tip", metavar="LINK", help="Link of the model that carries the tool. Default: the last one.")
 @option.explained
@@ -147,13 +147,13 @@ def _export(
     """Write a run as tables, or its cameras and arm in metres.
 
     With --to csv, writes a table for each result, a column for each index of an array, and fields.csv, which
-    says what every array is, in which unit.
+    gives meaning and unit of every array.
 
     The other kinds are in metres, by a known length: opencv the cameras for cv2.FileStorage, urdf the arm,
     ros static transforms of the cameras, json all numbers with their covariances. Cameras on the tool come
     in the frame of the flange: the hand–eye transformation.
 
-    With --nominal it lists the errors of zeros and axes of a model, the most significant first. With --frames
+    With --nominal it lists the errors of zeros and axes of a model, by significance. With --frames
     model, the cameras are in the base of that model, such as a robot's own, and the tool is its tip. Cameras
     on the tool are in that tip. A model that does not describe the arm, as one in which a joint turns the
     other way, ends in exit code 1, and so does a known length that contradicts its links or a prismatic
@@ -229,7 +229,7 @@ def _in_metres(
         value["mount"] = metric.mount
         words += [f"{view} camera {metric.summary()[f'{view} camera']}" for view in metric.view]
     found = opencv_cameras(metric, calibration)
-    if to in ("urdf", "ros"):  # poses of the cameras whose matrices are those of opencv
+    if to in ("urdf", "ros"):  # poses of the cameras whose matrices opencv gets
         metric = dataclasses.replace(metric, bodies=MetricParameters(*(part[None] for part in found.body)))
     if to == "opencv":
         value |= {"delta_chi2": found.delta_chi2, "lens_rms_px": found.lens_rms_px}
@@ -261,7 +261,7 @@ def _ends(between: str) -> Any:
 
 
 def _write_tables(run: Any, folder: Path) -> Iterator[Path]:
-    """A table that says what every field is, and one for each record."""
+    """A table of the meanings of all fields, and one for each record."""
     import numpy as np
 
     from projservo_cli.findings import sparse

@@ -22,13 +22,14 @@ if TYPE_CHECKING:
 
 _NAMING = {"plant": {"plant", "plant.use"}, "law": {"control", "control.laws"}}  # keys of --set
 _AGAIN = ", and the robot is not moved: --force records all poses again"
-_TRIALS = "trials.csv"  # in the folder of a run: the default table of a recording
-_UNUSED = ("config", "sets", "output", "data", "dry_run", "view", "animation")  # by the report of a sweep
+_TRIALS = "trials.csv"  # default table of a recording, in the folder of a run
+# Options that the report of a sweep ignores.
+_UNUSED = ("config", "sets", "output", "data", "dry_run", "view", "animation")
 
 
 _OF_STAGES = (
     option.configuration(
-        help="Configuration (YAML). Default: the one stored in the run that -o names, else paper.yaml."
+        help="Configuration (YAML). Default: the one stored in the run that -o names, otherwise paper.yaml."
     ),
     option.override,
     option.output(
@@ -45,16 +46,14 @@ _OF_STAGES = (
     click.option(
         "--mount",
         type=click.Choice(["world", "tool"]),
-        help="Where the table's cameras are: they stand still, or are on the tool. Default: world.",
+        help="Where the table's cameras are: fixed in the world, or on the tool. Default: world.",
     ),
     click.option("--joints", metavar="RRPRRR", help="Type of each joint of the table. Default: all R."),
     option.joint_unit(help="Unit of the table's revolute joints. Default: rad."),
     click.option(
         "--noise-px", metavar="S", type=option.NUMBER, help="Pixel noise of the table. Default: estimated."
     ),
-    click.option(
-        "--lens", is_flag=True, help="Estimate radial lens distortion, and its centre where it shows."
-    ),
+    click.option("--lens", is_flag=True, help="Estimate radial lens distortion, and its centre if it shows."),
     click.option(
         "--joint-model",
         metavar="auto|LIST",
@@ -65,9 +64,9 @@ _OF_STAGES = (
         "--image-size",
         metavar="[NAME=]WxH,...",
         help="Size of the images, px, or one of each view: by name, or in order (left, right; of a list of "
-        "detections by name, c2 before c10). Default: that of cameras or rig.",
+        "detections by name, c2 before c10). Default: the order of cameras or rig.",
     ),
-    option.force(help="Make the named stages even where they are up to date."),
+    option.force(help="Make the named stages even if they are up to date."),
     option.dry_run,
     option.threads(help="Threads. Default: all processors."),
     option.explained,
@@ -93,7 +92,7 @@ def _laws(context: click.Context, parameter: click.Parameter, incomplete: str) -
 def _stages_or_files(
     context: click.Context, parameter: click.Parameter, incomplete: str
 ) -> list[CompletionItem]:
-    """Further stages for the completion of a shell, else files."""
+    """Further stages for the completion of a shell, otherwise files."""
     del parameter
     further = [name for name in main.stages if name.startswith(incomplete) and name not in context.obj]
     return [*map(CompletionItem, further)] or [CompletionItem(incomplete, type="file")]
@@ -112,7 +111,7 @@ def _stages_or_files(
 @option.joint_unit(help="Unit of the table's revolute joints. Default: rad.")
 @option.speed_scale
 @option.confirm
-@option.force(help="Start again, whatever the table holds.")
+@option.force(help="Start again, although the table has rows.")
 @option.dry_run
 @option.explained
 @click.pass_obj
@@ -126,11 +125,12 @@ def _record(stages: Sequence[str], /, console: Console, **options: Any) -> int:
     The table grows as the robot goes. After an interruption the same command continues it; a table of another
     configuration is refused, unless --force starts again.
 
-    Before other stages, as in projservo record calibrate, -o is the run, and the table is data.table, else
-    trials.csv next to the run; a recording of another configuration of the same plant is made again.
+    Before other stages, as in projservo record calibrate, -o is the run, and the table is data.table,
+    otherwise trials.csv next to the run; a recording of another configuration of the same plant is made
+    again.
     """
     if options["joint_unit"] is not None and options["motions"] is None:
-        raise click.UsageError("--joint-unit is that of --motions, which is not given")
+        raise click.UsageError("--joint-unit is the unit of --motions, which is not given")
     if len(stages) > 1:
         return _make(console, stages, options)
     from projservo_cli.chain.recordings import data_table, recording_made
@@ -156,7 +156,7 @@ def _record(stages: Sequence[str], /, console: Console, **options: Any) -> int:
 
 
 def _recording_object(recording: Any, why: "WorkFailed | None") -> dict[str, Any]:
-    """The JSON object of a recording, and why it stopped short where it did."""
+    """The JSON object of a recording, and why it stopped short if it did."""
     explained: dict[str, Any] = recording.summary
     if why is None:
         return explained
@@ -164,7 +164,7 @@ def _recording_object(recording: Any, why: "WorkFailed | None") -> dict[str, Any
 
 
 def _motions(config: Any, options: Mapping[str, Any]) -> Any:
-    """The list of ``--motions``; None where none is given."""
+    """The list of ``--motions``; None if none is given."""
     from projservo_cli.store.observation_tables import read_joint_list
 
     if options["motions"] is None:
@@ -191,7 +191,7 @@ def _motions(config: Any, options: Mapping[str, Any]) -> Any:
     "--suggest",
     metavar="[N]",
     type=click.IntRange(1, 100),
-    help="Suggest N further poses to record, the most informative first; 5 without N.",
+    help="Suggest N further poses to record, by decreasing information; 5 without N.",
 )
 @click.argument("run", metavar="[RUN]", required=False, type=option.PATH, shell_complete=_stages_or_files)
 @click.option(
@@ -210,7 +210,7 @@ def _calibrate(stages: Sequence[str], console: Console, **options: Any) -> int:
     calibration as it is and writes suggestions.csv into the folder of the run, for record --motions.
 
     projservo calibrate RUN --refit NAME --data TABLE -o NEW keeps joints, markers and other cameras of RUN,
-    and fits the camera NAME, which moved, again. Exit code 1 where neither enough poses nor another camera
+    and fits the camera NAME, which moved, again. Exit code 1 if neither enough poses nor another camera
     confirm the joint readings.
     """
     if (options["run"] is None) != (options["refit"] is None):
@@ -245,7 +245,7 @@ def _plan(stages: Sequence[str], console: Console, **options: Any) -> int:
 @click.option(
     "--blind",
     is_flag=True,
-    help="Move a robot although cameras show no marker of the calibration, so that nothing is compared.",
+    help="Move a robot although cameras show no marker of the calibration, without a comparison.",
 )
 @click.option(
     "--goal",
@@ -305,7 +305,7 @@ def _report(stages: Sequence[str], console: Console, *, run: Path | None, **opti
 
     if run is not None and not run.exists():
         raise InputError(
-            f"{run}: there is no such folder: name that of a run, which projservo servo -o {run} makes, or "
+            f"{run}: there is no such folder: name the folder of a run (projservo servo -o {run}), or "
             "of a sweep"
         )
     if run is not None and (run.name == SWEEP or not run_path(run).is_file()):
@@ -351,7 +351,7 @@ def _asked(
 ) -> "Chain":
     """Return the chain of the call, by the configuration and the run; refuse a forbidden one.
 
-    recording : where it was made just now.
+    recording : if it was made just now.
     """
     from projservo_cli.chain.execution import Chain
     from projservo_cli.chain.recordings import pending_recording
@@ -375,7 +375,7 @@ def _asked(
 def _resolve(options: Mapping[str, Any], *, recording: bool = False) -> tuple["Config", "Run"]:
     """The configuration with all overrides, and the run as stored so far.
 
-    A table next to the run, or the one that a ``recording`` puts there, is that of the configuration unless
+    A table next to the run, or the one that a ``recording`` puts there, belongs to the configuration unless
     it names another.
     """
     from projservo_cli.config import Override, load_config, overridden
@@ -412,7 +412,7 @@ def _of_refit(options: Mapping[str, Any]) -> tuple["Config", "Run"]:
         raise click.UsageError(f"{flag}: -o {options['output']} is the run itself; name another")
     for name in ("config", "mount", "joints", "noise_px", "lens", "init", "cross_validate", "image_size"):
         if options[name]:
-            text = f"that of {before.path.parent} stands; leave it out"
+            text = f"the one in {before.path.parent} holds; leave it out"
             raise click.UsageError(f"--{name.replace('_', '-')} and {flag}: {text}")
     if options["refit"] not in before.calibration.view:
         raise click.UsageError(f"{flag}: the cameras are {', '.join(before.calibration.view)}")
@@ -438,7 +438,7 @@ def _from_sweep(options: Mapping[str, Any]) -> tuple["Config", "Run"]:
     from projservo_cli.sweeps.folder import run_of
 
     if options["config"]:
-        raise click.UsageError("-c and --from: the configuration is that of the sweep; leave -c out")
+        raise click.UsageError("-c and --from: the sweep has its configuration; leave -c out")
     config, calibration = run_of(options["origin"])
     if overrides := option.overrides(options):
         config = overridden(config, overrides)
@@ -450,7 +450,7 @@ def _from_sweep(options: Mapping[str, Any]) -> tuple["Config", "Run"]:
 
 
 def _run_of(options: Mapping[str, Any], config: "Config") -> "Run":
-    """The run where the user says, else in the folder of the configuration's name; empty where none is."""
+    """The run where the user says, else in the folder of the configuration's name; empty if none is."""
     from projservo_cli.store.files_and_locks import require_inside
     from projservo_cli.store.run_file import stored
 
@@ -462,7 +462,7 @@ def _run_of(options: Mapping[str, Any], config: "Config") -> "Run":
 
 
 def _require_optional(config: Any, wanted: Sequence[str]) -> None:
-    """Make sure, before any work, that ``view`` and ``animation`` can be made where they are wanted."""
+    """Make sure, before any work, that ``view`` and ``animation`` can be made if they are wanted."""
     from projservo_cli.config.settings_and_rules import truth_of
     from projservo_cli.records import InputError
     from projservo_cli.report.animation import plotly
@@ -491,7 +491,7 @@ def _optional_files(options: Mapping[str, Any]) -> list[str]:
 
 
 def _law_names(names: Sequence[str]) -> tuple[str, ...]:
-    """The laws of ``--law``, each once, registered names as the classes they stand for."""
+    """The laws of ``--law``, each once, registered names replaced by their classes."""
     from projservo_cli.experiment import law_target
     from projservo_cli.records import InputError
 
@@ -506,16 +506,19 @@ def _work(console: Console, chain: "Chain", options: Mapping[str, Any]) -> int:
     chain.read()
     _announce(console, chain)
     chain.make()
-    beside: dict[str, dict[str, Any]] = {"calibrate": {}, "report": {}}  # further values of their objects
+    more_values: dict[str, dict[str, Any]] = {
+        "calibrate": {},
+        "report": {},
+    }  # further values of their objects
     if (count := options.get("suggest")) is not None and not chain.lacks("calibrate"):
-        beside["calibrate"] = chain.suggestions(count)
+        more_values["calibrate"] = chain.suggestions(count)
     if "calibrate" in chain.names:
         done = not chain.lacks("calibrate")
         by_joints = done and chain.run.calibration.flange_chart is None
         beside["calibrate"]["joint_types_assumed"] = by_joints and chain.config.joint_types is None
     if (wanted := _optional_files(options)) and not chain.lacks("report"):
-        beside["report"] |= chain.optional_files(wanted)
-    beside["report"]["replayed"] = chain.replayed()
+        more_values["report"] |= chain.optional_files(wanted)
+    more_values["report"]["replayed"] = chain.replayed()
     from projservo_cli.records import WorkFailed
     from projservo_cli.report.json_objects import failed_object, stage_object
 
@@ -529,12 +532,12 @@ def _work(console: Console, chain: "Chain", options: Mapping[str, Any]) -> int:
             values[name] = failed_object(name, chain.run, why, chain.failed, chain.laws_done)
         else:
             values[name] = stage_object(name, chain.run, joints, chain.laws)
-            values[name] |= beside.get(name, {})
+            values[name] |= more_values.get(name, {})
     words = [line for name in values for line in words_of(name, values[name], detailed=console.verbose)]
     words += [f"table: {chain.recording.path}"] if chain.recording is not None else []
     words += [f"run: {chain.run.path}"] if chain.run.results else []
     console.report(values if len(values) > 1 else values[chain.names[0]], words)
-    findings = list(chain.findings(beside["calibrate"]))
+    findings = list(chain.findings(more_values["calibrate"]))
     for finding in findings:
         if finding.fatal or not console.quiet:
             click.echo(visible(f"projservo: {finding.text}"), err=True)

@@ -14,7 +14,7 @@ from projservo_cli.cli.program import main
 @option.configuration(help="Configuration of the sweep (YAML).", required=True)
 @option.override
 @option.output(metavar="DIR", help="Folder of the sweep. Default: results/<name of the sweep>.")
-@option.force(help="Start again, whatever the folder holds.")
+@option.force(help="Start again, although the folder has runs.")
 @option.dry_run
 @option.threads(help="Processes. Default: all processors.")
 @click.option(
@@ -44,7 +44,7 @@ def _sweep(
     projservo report SWEEP writes statistics and figures. With --scheduler the workers of a Dask cluster do
     the work; it needs pip install '.[cluster]' here and there.
     """
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # in the processes to come, from their beginning
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # also for child processes, from their start
     from projservo_cli.config import load_sweep
     from projservo_cli.store.files_and_locks import working_in
     from projservo_cli.store.sweep_table import SweepTable

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from projservo_cli.stages.doctor import Checked
     from projservo_cli.store.run_file import Run
 
-_SIZE_MM = 30.0  # of tags: what webcams at arm's length see with 25 px and more
+_SIZE_MM = 30.0  # size of tags that webcams at arm's length see with 25 px or more
 _BODIES = ("roof", "plate")
 
 
@@ -197,7 +197,7 @@ def _refit(checked: "Checked", stored: "Run | None", config: str, output: Path) 
 
 
 def _note_refuted(path: Path, refuted: str) -> None:
-    """Store what contradicts the recording of a run, empty for nothing, if that has changed."""
+    """Store the contradiction of a run's recording, empty if none, if it has changed."""
     from projservo_cli.store.files_and_locks import working_in
     from projservo_cli.store.run_file import load, save
 
@@ -226,7 +226,7 @@ def _table(rows: Sequence[Mapping[str, str]]) -> Iterator[str]:
 
 
 def _goal_pixels(settings: "Config", view: Sequence[str]) -> "list[FloatArray]":
-    """Pixels (g, 2) of the taught goal in the images of some views; none where there is none."""
+    """Pixels (g, 2) of the taught goal in the images of some views; none if there is none."""
     import numpy as np
 
     images = None if settings.task is None else settings.task.goal.images

@@ -13,12 +13,12 @@ from projservo_cli.cli.program import main
 
 # Squared error over its covariance that reveals another robot, or other units.
 _FAR = 20.0
-_TAUGHT = "# What the cameras saw: projservo teach. Name this file under task.goal, or task.start.\n"
+_TAUGHT = "# Images of the cameras: projservo teach. Name this file under task.goal, or task.start.\n"
 
 
 @main.command("teach", epilog="Example: projservo teach results/mine -c mine.yaml -o goal.yaml")
 @click.argument("run", required=False, type=option.PATH)
-@option.configuration(help="Configuration (YAML). Default: that in RUN, else paper.yaml.")
+@option.configuration(help="Configuration (YAML). Default: the one in RUN, otherwise paper.yaml.")
 @option.override
 @option.output(metavar="FILE", help="File to write (YAML). Default: goal.yaml, with --start start.yaml.")
 @click.option("--start", is_flag=True, help="It is a start that is taught: task.start.")
@@ -49,14 +49,14 @@ def _teach(
     force: bool,
     **options: Any,
 ) -> None:
-    """Write what the cameras see as a goal or a start.
+    """Write the images of the cameras as a goal or a start.
 
-    Looks where somebody has moved the robot to, with the hands away, averages --frames images and writes
+    Move the robot to the goal and take your hands away. Averages --frames images and writes
     their pixels, with their uncertainty and the joint readings: task.goal takes the file, task.start its
-    joints. A robot that can let go of its arm does so first, where somebody is at the terminal to move it,
+    joints. A robot that can let go of its arm does so first, if a user at the terminal can move it,
     and then holds it again. A simulated robot is put to --at.
 
-    Checks it against the calibration in RUN, by default that of the configuration's name in results, where
+    Checks it against the calibration in RUN, by default the run of the configuration's name in results, where
     there is one: markers that are off, and whether any joints show it. A goal that none do ends in exit
     code 1.
     """
@@ -92,7 +92,7 @@ def _teach(
             if start:
                 stage.require_start(taught)
             else:
-                stage.require_face(settings.face_numbers, taught, settings.trajectory.least_views)
+                stage.require_face(settings.face_numbers, taught, settings.trajectory.min_views)
                 several = settings.task is not None and bool(settings.task.goals)
                 hidden = stage.require_objects(taught, one_goal=not several)
             check = None
@@ -124,7 +124,7 @@ def _teach(
 
 
 def _print_taught(console: Console, path: Path, taught: Any, check: Any, setting: str) -> None:
-    """Print what was taught, how it agrees with the calibration, and the setting of the file."""
+    """Print the taught values, how they agree with the calibration, and the setting of the file."""
     import numpy as np
 
     value = {
@@ -172,7 +172,7 @@ def _print_taught(console: Console, path: Path, taught: Any, check: Any, setting
     metavar="CSV",
     type=click.Path(),
     required=True,
-    help="Joint readings, a row a pose: columns q1 ... qN, perhaps pose or left, right.",
+    help="Joint readings, one row per pose: columns q1 ... qN, perhaps pose or left, right.",
 )
 @click.option(
     "--dictionary",
@@ -185,7 +185,7 @@ def _print_taught(console: Console, path: Path, taught: Any, check: Any, setting
     "--board",
     metavar="KIND:CxR",
     help="A board instead of tags: chessboard:9x7 (inner corners) or charuco:11x8 (squares), and "
-    "charuco:11x8:first=20 where its first tag is 20.",
+    "charuco:11x8:first=20 if its first tag is 20.",
 )
 @click.option(
     "--points",
@@ -217,14 +217,14 @@ def _detect(
 
     The list of joint readings (--readings) says which images belong together. With columns left and right
     (or other names), these are the names of the images. With a column pose, images are those whose name ends
-    in that number. With neither, all folders are taken in the order of their names, one image a row; image_2
-    comes before image_10.
+    in that number. With neither, all folders are taken in the order of their names, one image per row;
+    image_2 comes before image_10.
 
     With --points corners, corner k of tag t is marker 4 t + k, in the order of the dictionary: top left, top
     right, bottom right, bottom left. With --points centers, tag t is marker t, at the crossing of its
     diagonals. With --board the markers are its inner corners, numbered row by row as OpenCV does; a
     chessboard of two odd or two even sides looks the same turned by 180°, and calibrate turns its numbering
-    right. Readings are copied as they are: say --joint-unit deg on calibrate where they are degrees.
+    right. Readings are copied as they are: say --joint-unit deg on calibrate if they are degrees.
     """
     import numpy as np
 
@@ -276,7 +276,7 @@ def _detect(
 
 
 def _sources(images: tuple[str, ...]) -> dict[str, str]:
-    """Folders or patterns of the images by the names of the cameras; a UsageError where these are none."""
+    """Folders or patterns of the images by the names of the cameras; a UsageError if these are none."""
     from projservo_cli.records import VIEWS
     from projservo_cli.settings.sections import is_view
 
@@ -323,7 +323,7 @@ def _sources(images: tuple[str, ...]) -> dict[str, str]:
     default=0.0,
     help="Deviation of the arm that no image shows, a coordinate, beyond the covariance.",
 )
-@option.joint_unit(help="Unit of the table's revolute joints. Default: that of the run.")
+@option.joint_unit(help="Unit of the table's revolute joints. Default: the unit of the run.")
 @option.explained
 def _validate(
     console: Console,
@@ -340,9 +340,9 @@ def _validate(
     """Predict held-out images, or positions, with a calibration.
 
     Compares the pixels of an observation table (--data) with those the calibration of a run predicts at the
-    table's joint readings. Ends in exit code 1 where their median distance passes three times the stated
-    error and the noise of the images together, or where that of one camera shows that it was moved. A table
-    of one posture is judged as doctor judges an arm at rest; of several, what changed is told beside the
+    table's joint readings. Ends in exit code 1 if their median distance passes three times the stated
+    error and the noise of the images together, or if the images of one camera show that it was moved. A table
+    of one posture is judged as doctor judges an arm at rest; of several, changes are reported with the
     medians.
 
     With --metric it compares positions that another instrument measured, such as a laser tracker. Its scale,
@@ -354,9 +354,9 @@ def _validate(
     if metric is None and (fit is not None or arm_std_mm):
         raise click.UsageError("--fit and --arm-std-mm are for --metric, which is not given")
     if data is None and metric is None:
-        raise click.UsageError("validate needs --data TABLE, or else --metric TABLE")
+        raise click.UsageError("validate needs --data TABLE, or --metric TABLE")
     if readings is not None and data is None:
-        raise click.UsageError("--readings are the joints beside --data, which is not given")
+        raise click.UsageError("--readings are the joints for --data, which is not given")
     if data is not None and metric is not None:
         raise click.UsageError("--data and --metric: validate takes one of them; leave the other out")
     from projservo_cli.calibration.checks.validation import median_limit

@@ -32,14 +32,14 @@ def with_limits(text: str, limits_deg: Sequence[tuple[float, float]], where: str
 
 
 def named_plant(text: str, where: str) -> tuple[str, dict[str, Any]]:
-    """Return the plant of a configuration and its options, whatever else the text holds.
+    """Return the plant of a configuration and its options, ignoring the rest of the text.
 
     An arm can be released, and its limits be found, with a file that has other faults.
     where : of the text, for messages. Raises InputError for a text that is no YAML.
     """
     root = _parsed(yaml.compose, text, where)
     if [key.value for key, _ in getattr(root, "value", ()) if key.value == "plant"][1:]:
-        raise InputError(f"{where}: plant stands there twice; keep one")
+        raise InputError(f"{where}: plant occurs twice; keep one")
     values = _parsed(yaml.safe_load, text, where)
     plant = values.get("plant") if isinstance(values, dict) else None
     if isinstance(plant, str):
@@ -58,7 +58,7 @@ def _parsed(parse: Callable[[str], Any], text: str, where: str) -> Any:
 
 
 def _value(node: yaml.MappingNode, key: str) -> Any:
-    """Return the node of a key; None where there is none."""
+    """Return the node of a key; None if there is none."""
     return next((value for name, value in node.value if name.value == key), None)
 
 
@@ -73,7 +73,7 @@ def _replaced(text: str, node: yaml.Node, value: str) -> str:
 
 
 def _end(node: yaml.Node) -> int:
-    """Place after the last character of a node; that of a block includes comments after it."""
+    """Place after the last character of a node; the end of a block includes comments after it."""
     if isinstance(node, yaml.CollectionNode) and not node.flow_style and node.value:
         last = node.value[-1]
         return _end(last[1] if isinstance(last, tuple) else last)

@@ -1,4 +1,4 @@
-"""From a configuration to what each stage is given: the values that it reads, and no others.
+"""From a configuration to the inputs of each stage: the values that it reads, and no others.
 
 Every function returns a record, of which the key of the result is a hash. Units, defaults that depend on
 other values, and descriptions of robot and rig are resolved here and nowhere below.
@@ -62,8 +62,8 @@ from projservo_cli.store.observation_tables import identity_in
 from projservo_cli.task.incidences import Incidence
 from projservo_cli.task.stand_off import StandOff
 
-_RANDOM_POSES = 12  # of trials where joints may be read or images taken with faults
-_TICKS = 4096  # in a turn of an encoder that is as coarse as any
+_RANDOM_POSES = 12  # number in trials whose joints or images may have faults
+_TICKS = 4096  # counts per turn of the coarsest encoders
 _EXPECTED = {
     "table": "a table, which projservo record calibrate makes",
     "readings": "a table of joints: pose, q1 ... qN",
@@ -74,7 +74,7 @@ Files = Mapping[str, File]  # by their roles; read from disk if not given
 
 
 def calibration_inputs(config: Config, files: Files | None = None) -> CalibrationInputs | RefitInputs:
-    """Return the inputs of a calibration: a table, else trials of the simulated robot; then its refits."""
+    """Return the inputs of a calibration: a table, or trials of the simulated robot; then its refits."""
     settings, data, size = config.calibration, config.data, config.image_size_px
     source: Table | Trials
     if data is not None:
@@ -83,7 +83,7 @@ def calibration_inputs(config: Config, files: Files | None = None) -> Calibratio
         mount = data.mount or (None if config.rig is None else config.rig.mount)
         source = Table(table, readings, *kind, size, data.noise_px, _seed(config), mount, stated)
     else:
-        # A factor of commands to a robot that may do harm; what simulated trials show does not hang on it.
+        # A factor of commands to a robot that may do harm; simulated trials do not depend on it.
         at_full_speed = {"plant": config.plant.model_copy(update={"speed_scale": 1.0})}
         source = _trials(config.model_copy(update=at_full_speed), truth_of(config, face=False), files)
     how = Estimation(
@@ -158,14 +158,14 @@ def _markers(config: Config) -> Markers:
 
 
 def _numbers(config: Config, command: str) -> tuple[int, ...]:
-    """Numbers of the markers that a robot observes. Raises InputError where they are unknown."""
+    """Numbers of the markers that a robot observes. Raises InputError if they are unknown."""
     if (numbers := _markers(config).known) is None:
         raise InputError(f"{command} needs to know which markers the robot observes: set markers.numbers")
     return numbers
 
 
 def _dictionary(config: Config) -> str | None:
-    """Dictionary of the tags: that of the options of a robot's class, else that of the markers."""
+    """Dictionary of the tags: from the options of a robot's class, otherwise from the markers."""
     given = config.plant.options.get("dictionary", _markers(config).tag_dictionary)
     return None if given is None else str(given)
 
@@ -228,7 +228,7 @@ def _incidence(
 ) -> Incidence:
     """Return a pair of features, as messages and figures write it, with the numbers of its markers.
 
-    displaced : of the goal, so that nobody takes an approach for the arrival.
+    displaced : whether the goal is displaced, so that an approach is not taken for the arrival.
     carriers : names of the objects of the goal.
     """
     back = "" if displaced is None else f" ({displaced.words})"
@@ -254,13 +254,13 @@ def _displacement(config: Config) -> StandOff | None:
         if not isinstance(one.source, str):
             raise InputError(
                 f"task.goal.displaced: {name} is of markers of {one.on}, which are not displaced: teach the "
-                "approach as a goal of its own"
+                "approach as a separate goal"
             )
     on = {one.on for one in scenes.values()}
     if len(on) > 1:
         raise InputError(
             f"task.goal.displaced: the incidences of the goal are on {' and '.join(sorted(on))}, so teach "
-            "the approach as a goal of its own"
+            "the approach as a separate goal"
         )
     if config.mount == TOOL:
         raise InputError(
@@ -286,7 +286,7 @@ def servo_inputs(config: Config, files: Files | None = None) -> ServoInputs:
 
 
 def _carriers(config: Config, files: Files | None) -> tuple[CarryingObject, ...]:
-    """Return the objects that the goal is carried by; none for a goal that stands still."""
+    """Return the objects that the goal is carried by; none for a fixed goal."""
     if config.task is None:
         return ()
     names = carriers_of(config.task.goal, config.features)
@@ -378,7 +378,7 @@ def scenery_of(config: Config) -> Scenery:
 def files_of(config: Config, gone: Mapping[str, str] | None = None) -> Files:
     """Read the input files, by their roles; InputError if one cannot be read.
 
-    gone : hashes that files had, by their paths, which stand where the files are gone.
+    gone : hashes that files had, by their paths, which hold if the files are gone.
     """
     rendered = config.plant.rendered is not None
     paths = {
@@ -393,17 +393,17 @@ def files_of(config: Config, gone: Mapping[str, str] | None = None) -> Files:
 
 
 def _file(role: str, path: str, files: Files | None) -> File:
-    """The file at a path: of ``files``, else as it is read now."""
+    """The file at a path: of ``files``, otherwise as it is read now."""
     return _read(role, path) if files is None else files[role]
 
 
 def _file_if(role: str, path: str | None, files: Files | None) -> File | None:
-    """The file at a path, likewise; None where the configuration names none."""
+    """The file at a path, likewise; None if the configuration names none."""
     return None if path is None else _file(role, path, files)
 
 
 def _read(role: str, path: str, gone: Mapping[str, str] | None = None) -> File:
-    """Read the file of a role; an InputError where it cannot be read."""
+    """Read the file of a role; an InputError if it cannot be read."""
     expected = _EXPECTED.get(role, "a table of a camera that moved")
     return File.of(path, expected, (gone or {}).get(path, ""), files_named(path) if role == "mjcf" else ())
 
@@ -416,7 +416,7 @@ def scene_of(
 ) -> RenderedScene | None:
     """Return the scene of rendered cameras; None for cameras that see points.
 
-    objects : those that stand in it; with None in place of their sections, where goals were taught.
+    objects : in the scene; with None in place of their sections, as goals were taught.
     """
     options = config.plant.rendered
     if options is None or config.arm is None or config.rig is None:
@@ -430,7 +430,7 @@ def scene_of(
     return described_scene(config.arm, config.rig, _markers(config), options, mjcf, tuple(tags))
 
 
-# What drives.
+# Values that drive a robot.
 
 
 def joints_of(config: Config, *, paced: bool = True) -> JointSettings:
@@ -448,9 +448,9 @@ def joints_of(config: Config, *, paced: bool = True) -> JointSettings:
 
 
 def _drive(config: Config, truth: Truth | None, files: Files | None = None, *, shows: bool = False) -> Drive:
-    """Return how a robot of the contract is driven: the simulated one of a truth, else somebody's.
+    """Return how a robot of the contract is driven: the simulated one of a truth, or the user's.
 
-    shows : whether cameras of a simulated one show objects, as those of somebody's do.
+    shows : whether cameras of a simulated one show objects, as cameras of the user's robot do.
     """
     plant, period, robot, objects = config.plant, config.control.period_s, None, config.objects.named
     further = tuple(number for one in objects.values() for number in one.numbers)
@@ -463,7 +463,7 @@ def _drive(config: Config, truth: Truth | None, files: Files | None = None, *, s
 
 
 def _own(config: Config) -> OwnRobot:
-    """The robot of somebody's."""
+    """The user's robot."""
     plant, markers = config.plant, _markers(config)
     return OwnRobot(
         target=plant.target,
@@ -486,11 +486,11 @@ def _seed(config: Config) -> int:
 
 
 def _trials(config: Config, truth: Truth | None, files: Files | None = None) -> Trials:
-    """Trial motions and the robot driven through them: the simulated one of a truth, else somebody's."""
+    """Trial motions and the robot driven through them: the simulated one of a truth, or the user's."""
     settings, plant, reference = config.calibration, config.plant, config.reference
     if reference is None:
         raise InputError("trial motions need a reference: set calibration.reference or task.start")
-    # The ideal plant stands wherever it is sent.
+    # The ideal plant reaches every set-point.
     driven = truth is None or plant.rendered is not None or config.disturbance.part(Faults) != Faults()
     poses = settings.random_poses
     if poses is None:

@@ -1,6 +1,6 @@
 """From YAML text and overrides to a checked configuration, or to all that is wrong with it; and back.
 
-YAML is read safely, each key and value with the place it stands at. Numbers and booleans follow the YAML 1.2
+YAML is read safely, each key and value with its line. Numbers and booleans follow the YAML 1.2
 core schema: ``1e-3`` is a number, ``on`` and ``12:30`` are text. Duplicate keys are refused; aliases, nesting
 and size are bounded.
 """
@@ -34,7 +34,7 @@ from projservo_cli.simulation.urdf import read_urdf
 from projservo_cli.store.display import checked_array, plain, require_radians
 from projservo_cli.store.files_and_locks import bytes_of, text_of
 
-try:  # of a text of the largest size, libyaml makes nodes in half a second, PyYAML itself in five
+try:  # for a text of the largest size, libyaml makes nodes in half a second, PyYAML itself in five
     from yaml import CSafeDumper as _Emitter
     from yaml import CSafeLoader as _Parser
 except ImportError:  # either will do
@@ -71,7 +71,7 @@ _FILES = (
     *(("calibration", "init"), ("robot", "mjcf"), ("robot", "urdf")),
 )
 _YAML = (".yaml", ".yml")
-_DIGITS = 9  # of a position in a list
+_DIGITS = 9  # digits of a position in a list
 _MOST = 200  # problems that are looked at; who has more has taken another file
 _Path = tuple[str | int, ...]
 
@@ -85,12 +85,12 @@ _Model = TypeVar("_Model", bound=Section)
 
 
 def _shortened(text: str, max_length: int = 80) -> str:
-    """A text for a message, cut where it is long."""
+    """A text for a message, cut if it is long."""
     return text if len(text) <= max_length else text[: max_length - 1] + "…"
 
 
 class _Loader(_Parser):
-    """Leaves plain text as it stands."""
+    """Leaves plain text as it is."""
 
 
 _Loader.yaml_implicit_resolvers = {}
@@ -130,7 +130,7 @@ class _Document:
             self.wrong((), f"not valid YAML: {' '.join(str(error).split())}", name)
 
     def wrong(self, path: _Path, what: str, place: str = "") -> None:
-        """Note something wrong, where ``path`` stands or at a place that no path leads to."""
+        """Note an error at ``path``, or at a place that no path leads to."""
         self.problems.append((path, what, place))
 
     @classmethod
@@ -163,12 +163,12 @@ class _Document:
             return self._mapping(node, path)
         if isinstance(node, yaml.SequenceNode):
             return [self._value(item, (*path, i)) for i, item in enumerate(node.value)]
-        if getattr(node, "style", None):  # in quotes, or a block of text
+        if getattr(node, "style", None):  # the text is in quotes, or a block
             return node.value
         meaning = next((meaning for pattern, meaning in _CORE if pattern.fullmatch(node.value)), str)
         try:
             return meaning(node.value)
-        except ValueError:  # of more digits than Python converts
+        except ValueError:  # it has more digits than Python converts
             self.wrong(path, "cannot be read as a number", self._place(node.start_mark))
             return None
 
@@ -244,7 +244,7 @@ def _require_bounded(text: str) -> None:
 
 
 class _UnfitError(ValueError):
-    """The text cannot be that of a configuration."""
+    """The text cannot be a configuration."""
 
 
 @dataclass(frozen=True)
@@ -307,7 +307,7 @@ class Config(Settings):
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "Config":
-        """Return a configuration of values at hand, such as that of an arm of your own.
+        """Return a configuration of values at hand, such as your arm's.
 
         Parameters
         ----------
@@ -396,7 +396,7 @@ def load_config(
 
     path : the YAML file; None for a blank recorded configuration, which overrides fill.
     overrides : ``a.b=v`` as for ``--set``, applied in order.
-    text : its content, where it is already at hand; ``path`` then only names it in messages.
+    text : its content, if it is already at hand; ``path`` then only names it in messages.
     teaching : a goal or a start whose file does not exist yet is still to be taught, and left out.
     Raises InputError, one line ``file:line:column: key: message`` for each error.
     """
@@ -475,7 +475,7 @@ def _leaves(key: str, value: Any) -> Iterator[tuple[str, Any]]:
 
 
 def to_goals(what: str, goals: Sequence[str]) -> list[Override]:
-    """Return overrides that messages call by ``what``: to goals of some names, one after the other."""
+    """Return overrides that messages name ``what``: to goals of some names, one after the other."""
     names = [goal.removesuffix(".yaml") for goal in goals]
     steps = [{"to": name} for name in names] if len(names) > 1 else []
     alone = [] if steps or names == ["goal"] else [Override(what, "task.goal", names[0])]
@@ -504,11 +504,11 @@ def checked_values(what: str, model: type[_Model], values: Mapping[str, Any]) ->
 
 
 def _validated(model: type[_Model], document: _Document) -> _Model:
-    """What a document holds; an InputError with all that is wrong with it."""
+    """Validated content of a document; an InputError with all of its errors."""
     wrong: list[ErrorDetails] = []
     try:
-        if all(path for path, *_ in document.problems):  # of a text that is none, no more can be said
-            held = model.model_validate(document.values)
+        if all(path for path, *_ in document.problems):  # a broken text has no other errors
+            validated = model.model_validate(document.values)
     except ValidationError as error:
         wrong = error.errors(include_url=False)
     if broken := {part["loc"][0] for part in wrong if part["loc"]}:
@@ -522,7 +522,7 @@ def _validated(model: type[_Model], document: _Document) -> _Model:
         document.wrong(path, what)
     if document.problems:
         raise document.refused()
-    return held
+    return validated
 
 
 def to_yaml(config: Config) -> str:
@@ -533,7 +533,7 @@ def to_yaml(config: Config) -> str:
 def stored_yaml(config: Config, names: Mapping[str, str] = MappingProxyType({})) -> str:
     """The configuration as ``to_yaml``, with the passwords of URLs masked: for files and pages.
 
-    names : by texts, such as paths, what is to stand for them: lines then break alike however long they are.
+    names : replacements of texts, such as paths: lines then break alike however long they are.
     """
     return plain_yaml(_renamed(masked(_without_unset(config)), names))
 
@@ -555,7 +555,7 @@ def plain_yaml(values: Any) -> str:
 
 
 def _spell_out(values: dict[str, Any]) -> None:
-    """Replace ``plant: module:Class`` and ``law: module:Class`` by the keys they stand for."""
+    """Replace ``plant: module:Class`` and ``law: module:Class`` by their keys."""
     if isinstance(values.get("plant"), str):
         values["plant"] = {"use": values["plant"]}
     plant = values.get("plant")
@@ -586,7 +586,7 @@ def _fill_in(values: dict[str, Any], path: pathlib.Path | str | None) -> None:
 
 
 def _fill_in_arm(document: _Document) -> None:
-    """Add the screws of the joints to the name of an MJCF, or replace that of a URDF by them."""
+    """Add the screws of the joints to the name of an MJCF, or replace the name of a URDF by them."""
     robot = document.values.get("robot")
     for kind in ("mjcf", "urdf") if isinstance(robot, dict) else ():
         file, tip = robot.get(kind), robot.get("tip")
@@ -658,8 +658,8 @@ def _fill_in_goal(
         further = {name: value for name, value in holder[key].items() if name != "taught"}
         holder[key] = holder[key]["taught"]
     if isinstance(holder.get(key), str):
-        anew = teaching and document.values.get("objects")  # a file without the object is no goal yet
-        taught = None if anew else _taught(document, path, base, holder[key], teaching)
+        new_object = teaching and document.values.get("objects")  # a file without the object is no goal yet
+        taught = None if new_object else _taught(document, path, base, holder[key], teaching)
         start = document.values["task"].get("start")
         still_to_be = {"joints": start} if isinstance(start, dict) else {"roll_deg": 0.0}
         holder[key] = still_to_be if taught is None else {**taught, **further}
@@ -705,20 +705,20 @@ def _check_options(document: _Document) -> None:
 
 def _translated(model: type[BaseModel], errors: Sequence[ErrorDetails]) -> Iterator[Note]:
     """Return the findings of pydantic, in words; of a value that may be of several kinds one finding."""
-    places = [
+    locations = [
         tuple(part for part in error["loc"] if part != "[key]" and not _is_kind(part)) for error in errors
     ]
-    for error, place in list(zip(errors, places, strict=True))[:_MOST]:
+    for error, place in list(zip(errors, locations, strict=True))[:_MOST]:
         if error["type"] == CONTRADICTIONS:
             yield from error["ctx"]["found"]
             continue
-        inside = any(len(other) > len(place) and other[: len(place)] == place for other in places)
+        inside = any(len(other) > len(place) and other[: len(place)] == place for other in locations)
         of_kind = _is_kind(error["loc"][-1])
         if inside and (of_kind or error["type"] == "too_short"):
             continue  # a list counts only its valid entries, and is of its kind
         kinds = [
             one
-            for one, other in zip(errors, places, strict=True)
+            for one, other in zip(errors, locations, strict=True)
             if other == place and _is_kind(one["loc"][-1])
         ]
         if not of_kind or len(kinds) == 1:
@@ -739,14 +739,14 @@ def _wanted(error: ErrorDetails) -> str:
 
 
 def _words(error: ErrorDetails) -> list[str]:
-    """The words of which a value must be one; none where it may be any."""
+    """The words of which a value must be one; none if it may be any."""
     if error["type"] != "literal_error":
         return []
     return [word.strip("'") for word in error["ctx"]["expected"].replace(" or ", ", ").split(", ")]
 
 
 def _requirement(error: ErrorDetails) -> str:
-    """Say what a value does not meet."""
+    """State the condition that a value violates."""
     phrase = _PHRASES.get(error["type"])
     return error["msg"] if phrase is None else phrase.format(**error.get("ctx", {}))
 
@@ -759,7 +759,7 @@ def _phrase(model: type[BaseModel], error: ErrorDetails) -> str:
             return "control.laws is set as well; keep one" if both else "must be the name of one law"
         return f"unknown key; {_nearest(path[-1], sorted(_model_at(model, path[:-1]).model_fields))}"
     if kind == "string_pattern_mismatch":
-        return f"{_displayed(given)} must be letters R and P, one a joint"
+        return f"{_displayed(given)} must be letters R and P, one per joint"
     if words := _words(error):
         return f"{_displayed(given)} is not one of them; {_nearest(given, words)}"
     plain = isinstance(given, (str, int, float)) or given is None
@@ -767,7 +767,7 @@ def _phrase(model: type[BaseModel], error: ErrorDetails) -> str:
 
 
 def _displayed(value: Any) -> str:
-    """A value as it would stand in YAML, _shortened."""
+    """A value as in YAML, _shortened."""
     return _shortened(json.dumps(value) if value is None or isinstance(value, bool) else repr(value), 40)
 
 
@@ -817,7 +817,7 @@ def _without_unset(value: Any) -> Any:
 
 
 class _Dumper(_Emitter):
-    """Dumps without aliases, so that every value stands where it is read."""
+    """Dumps without aliases, so that every value is written where it is read."""
 
     def ignore_aliases(self, data: Any) -> bool:
         return True

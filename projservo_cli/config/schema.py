@@ -36,10 +36,10 @@ def json_schema() -> dict[str, Any]:
         task[key] = {"anyOf": [task[key], {"type": "string"}], "description": what}
     ((name, one),) = task["goals"]["patternProperties"].items()
     task["goals"]["patternProperties"] = {name: {"anyOf": [one, {"type": "string"}]}}
-    schema["$defs"]["TaskSettings"]["required"].remove("goal")  # by default that of the last step
+    schema["$defs"]["TaskSettings"]["required"].remove("goal")  # by default, the goal of the last step
     schema["$defs"]["Goal"]["properties"]["taught"] = {
         "type": "string",
-        "description": "File that projservo teach wrote, beside incidences.",
+        "description": "File that projservo teach wrote, for use with incidences.",
     }
     return {**schema, "title": "Configuration of projservo"}
 
@@ -56,7 +56,7 @@ def as_text(schema: dict[str, Any]) -> str:
 
 def _schema(model: type[BaseModel]) -> dict[str, Any]:
     schema: dict[str, Any] = _without_titles(model.model_json_schema(schema_generator=_Generator))
-    schema["required"].remove("name")  # by default that of the file
+    schema["required"].remove("name")  # by default, the name of the file
     return {"$schema": _DRAFT, **schema}
 
 
@@ -85,9 +85,9 @@ def _without_titles(value: Any) -> Any:
 
 
 def starter(arm: str | None = None) -> str:
-    """A configuration to start from: for a kind of arm that people build, else one that speaks of every key.
+    """A configuration to start from: for a kind of arm that people build, or one that describes every key.
 
-    The latter comments its sections itself, but for those of settings, of which it holds at most values
+    The latter comments its sections itself, except settings, of which it holds at most values
     that are not the defaults: these are filled from the models.
     """
     if arm is not None:

@@ -32,7 +32,7 @@ from projservo_cli.store.display import Printed
 
 
 def _folder_name(name: str) -> str:
-    """A name that can be that of a folder; else ValueError."""
+    """A name that a folder can have; otherwise ValueError."""
     if name != name.strip() or name in {"", ".", ".."} or any(c in '/\\:*?"<>|' or c < " " for c in name):
         raise ValueError("must be usable as the name of a folder: no path separators, no surrounding spaces")
     return name
@@ -42,11 +42,11 @@ FolderName = Annotated[str, StringConstraints(max_length=100), AfterValidator(_f
 
 
 _Rule = Callable[..., Iterator[Note]]
-_RULES: dict[_Rule, set[str]] = {}  # with the sections that each takes
+_RULES: dict[_Rule, set[str]] = {}  # sections that each rule takes
 
 
 def _between(rule: _Rule) -> _Rule:
-    """Mark a rule between sections: those that its arguments name, asked where all of them are sound."""
+    """Mark a rule between sections: those that its arguments name, asked if all of them are sound."""
     _RULES[rule] = {*inspect.signature(rule).parameters}
     return rule
 
@@ -132,14 +132,14 @@ def _images_of(
         return
     numbers = images.markers or markers.front
     yield from markers.unknown(images.markers or (), *path, "markers")
-    counts = Counter[int]()  # of cameras that see each marker
+    counts = Counter[int]()  # number of cameras that see each marker
     for key in (*images.view, *map(sigma_key, images.view)):
         given = images.side(key)
         if given is not None and len(given) != len(numbers):
             yield (*path, key), f"{len(given)} entries for {len(numbers)} markers"
         elif key in images.view:
             counts.update(number for number, at in zip(numbers, given or (), strict=True) if at is not None)
-    enough = trajectory.least_views or len(images.view)
+    enough = trajectory.min_views or len(images.view)
     for key in images.view:
         pixels = dict(zip(numbers, images.side(key) or (), strict=False))
         whole = len(pixels) == len(numbers) == len(images.side(key) or ())
@@ -185,7 +185,10 @@ def _objects(
         yield ("objects",), "cameras on the tool see the scene that the goal is on: its images carry the goal"
     for name, one in objects.named.items():
         for number in (n for n in one.numbers if markers is not None and n in (markers.known or ())):
-            yield ("objects", name), f"marker {number} is on the tool: an object has markers of its own"
+            yield (
+                ("objects", name),
+                f"marker {number} is on the tool: each marker belongs to one object or the tool",
+            )
             break
         if plant.use == RENDERED and not one.placed:
             yield ("objects", name), "plant mujoco shows tags: give number, size_m and pose of each"
@@ -194,7 +197,7 @@ def _objects(
 
 
 def carriers_of(goal: Goal, features: Mapping[str, Feature]) -> tuple[str, ...]:
-    """Names of the objects that a goal was taught on; none for one that stands still, or is a retreat."""
+    """Names of the objects that a goal was taught on; none for a fixed goal, or a retreat."""
     if goal.of_start:
         return ()
     if goal.on is not None:
@@ -207,7 +210,7 @@ def carriers_of(goal: Goal, features: Mapping[str, Feature]) -> tuple[str, ...]:
 def _carried(
     objects: Objects, features: Mapping[str, Feature], task: TaskSettings | None, plant: PlantSettings
 ) -> Iterator[Note]:
-    """Objects that are none, a goal that would be torn, and one of which nobody saw the object."""
+    """Unknown objects, a goal that would be torn, and a goal whose object was not seen."""
     known = f"objects: {', '.join(objects.named) or 'none'}"
     for name, feature in features.items():
         if feature.on not in (*WORLD_AND_TOOL, *objects.named):
@@ -246,10 +249,10 @@ def _carried_by(
                 f"{pair[1]} is on {on}, and the goal on {carrier}: put {pair[1]} on {carrier}, or leave on "
                 "out, for features on others as well",
             )
-    shown = goal.objects.of(carrier)
-    if shown is None and (goal.images is not None or not plant.simulated):
+    carried = goal.objects.of(carrier)
+    if carried is None and (goal.images is not None or not plant.simulated):
         yield path, f"does not show where {carrier} was: teach it again, projservo teach"
-    elif shown is not None and {*(shown.markers or ())} - {*numbers}:
+    elif carried is not None and {*(carried.markers or ())} - {*numbers}:
         yield (*path, "objects", carrier), f"has markers that are not of {carrier}: teach it again"
 
 
@@ -279,7 +282,7 @@ def _rendered(plant: PlantSettings, noise: Noise, markers: Markers | None, rig: 
         if getattr(noise, key) != getattr(Noise(), key):
             yield (
                 ("noise", key),
-                "is that of projected points; images of plant mujoco have options.grey_noise",
+                "applies to projected points; images of plant mujoco have options.grey_noise",
             )
     if markers is not None and markers.tags is None:
         yield ("markers",), "plant mujoco shows tags: set markers.tags, such as roof"
@@ -294,13 +297,13 @@ def _dictionary(plant: PlantSettings, markers: Markers | None) -> Iterator[Note]
 
 @_between
 def _cameras(plant: PlantSettings, markers: Markers | None, cameras: Cameras | None) -> Iterator[Note]:
-    """Cameras of nobody, or with nothing to find."""
+    """Cameras without a robot, or without markers."""
     if cameras is None:
         return
     if plant.simulated:
         yield (
             ("cameras",),
-            "are those of a robot that is not simulated: set plant.use to its class, or leave them out",
+            "belong to a robot that is not simulated: set plant.use to its class, or leave them out",
         )
     if markers is None or not markers.given("tags", "numbers", "board"):
         yield (
@@ -320,7 +323,7 @@ def _same_mount(rig: Rig | None, data: Data | None) -> Iterator[Note]:
 def _moving_images(rig: Rig | None, trajectory: Trajectory) -> Iterator[Note]:
     """Yield regions of images that move with the tool."""
     if rig is not None and rig.mount == TOOL and trajectory.keep_out:
-        yield ("trajectory", "keep_out"), "are regions of images that stand still; cameras on the tool move"
+        yield ("trajectory", "keep_out"), "are regions of fixed images; cameras on the tool move"
 
 
 @_between
@@ -364,7 +367,7 @@ def _disturbed_objects(disturbance: Disturbance, objects: Objects, plant: PlantS
 
 @_between
 def _followed_plan(control: Control, trajectory: Trajectory) -> Iterator[Note]:
-    """Yield modes that follow a plan without a time, or no plan where one has to keep out of regions."""
+    """Yield modes that follow a plan without a time, or no plan if one has to keep out of regions."""
     limits = (control.joint_speed_limit_deg_s, control.prismatic_speed_limit_m_s)
     if any(mode != REGULATE for mode in control.mode) and {*limits, trajectory.duration_s} == {None}:
         yield (
@@ -407,7 +410,7 @@ def _missing(sections: Mapping[str, Any]) -> Iterator[Note]:
 
 
 class Settings(Printed, Root):
-    """Values of all sections, and what follows from them."""
+    """Values of all sections, and values derived from them."""
 
     name: FolderName = Field(description="name of the run and of its folder; default: name of the file")
     seed: Whole = Field(0, description="seed of all random numbers; the same seed gives the same run")
@@ -448,7 +451,7 @@ class Settings(Printed, Root):
 
     @property
     def arm(self) -> RobotSettings | None:
-        """The robot where its kinematics are given."""
+        """The robot if its kinematics are given."""
         return self.robot if self.robot is not None and self.robot.joints else None
 
     @property
@@ -468,7 +471,7 @@ class Settings(Printed, Root):
 
     @property
     def steps(self) -> dict[str, TaskStep]:
-        """Steps of the task by their names; none where it is a single motion."""
+        """Steps of the task by their names; none if it is a single motion."""
         return {} if self.task is None else self.task.named_steps
 
     def at_step(self, name: str) -> Self:
@@ -517,7 +520,7 @@ class Settings(Printed, Root):
 
     @property
     def image_size_px(self) -> ImageSize | None:
-        """Width and height of both images, or those of each, if they are known."""
+        """Width and height of both images, or of each, if they are known."""
         if self.data is not None and self.data.image_size_px is not None:
             return cast(ImageSize, self.data.image_size_px)
         if self.cameras is not None:
@@ -528,7 +531,7 @@ class Settings(Printed, Root):
 
 
 def truth_of(config: Settings, *, face: bool = True) -> Truth:
-    """Robot, rig and markers as they are; an InputError where a part of it is missing.
+    """Robot, rig and markers as they are; an InputError if a part of it is missing.
 
     The same values give the same object, so that derived results are kept.
     face : whether it has the face, of which a calibration knows nothing.
@@ -542,7 +545,7 @@ def truth_of(config: Settings, *, face: bool = True) -> Truth:
     rendered, n = config.plant.rendered, config.noise
     if rendered is not None and any(any(camera.lens) for camera in config.rig.cameras.values()):
         raise InputError(
-            "rig: lens is that of cameras that see points: of rendered ones set plant.options.k1"
+            "rig: lens applies to cameras that see points: for rendered ones set plant.options.k1"
         )
     factor = n.outlier_factor if n.outlier_share else NORMAL.outlier_factor
     noise = NoiseShape(math.inf if n.tail_dof is None else n.tail_dof, n.outlier_share, factor)

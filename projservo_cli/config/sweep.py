@@ -31,7 +31,7 @@ class _Linked(Section):
 
 
 def _axis(value: Any) -> Any:
-    """Values are those of the key of the name of the axis; a mapping adds further keys to each."""
+    """Values belong to the key that names the axis; a mapping adds further keys to each."""
     if isinstance(value, dict) and not {*_Linked.model_fields} & {*value}:
         return {"keys": [""], "values": list(value), "also": value}
     if isinstance(value, list):
@@ -70,7 +70,7 @@ class Distribution(OneOf):
 
 
 class _Tasks(OneOf):
-    """Tasks instead of that of the base, which the runs of a cell take in turn."""
+    """Tasks instead of the task of the base, which the runs of a cell take in turn."""
 
     one_of = ("random", "listed")
     random: Count | None = Field(
@@ -82,7 +82,7 @@ class _Tasks(OneOf):
     )
     listed: Annotated[tuple[dict[str, Plain], ...], Field(min_length=1)] | None = Field(
         None,
-        description="tasks instead of random ones, each with keys of task that replace those of the base",
+        description="tasks instead of random ones, each with keys of task that replace keys of the base",
     )
 
     @property
@@ -109,7 +109,7 @@ class SweepConfig(Root):
     base: Annotated[_Bases, BeforeValidator(one_or_more, json_schema_input_type=_Bases | str)] = Field(
         description="configuration files, relative to this file; several are an axis of the grid"
     )
-    set: dict[str, Plain] = Field({}, description="values that replace those of the base in every run")
+    set: dict[str, Plain] = Field({}, description="values that replace values of the base in every run")
     runs: Annotated[int, Field(ge=1, le=100_000_000, strict=True)] = Field(
         100, description="number of runs of each cell"
     )
@@ -136,20 +136,20 @@ class SweepConfig(Root):
 
     @property
     def listed_tasks(self) -> tuple[dict[str, Plain], ...]:
-        """Tasks as they are listed; none where they are random, or that of the base."""
+        """Tasks as they are listed; none if they are random, or the task of the base."""
         return () if self.tasks is None else self.tasks.listed or ()
 
     def between(self, sound: Mapping[str, Any]) -> Iterator[Note]:
-        """Names and values that stand twice, and axes without effect."""
+        """Names and values that occur twice, and axes without effect."""
         if len(names := {pathlib.Path(base).stem for base in self.base}) < len(self.base):
             yield ("base",), f"two files of one name, {', '.join(sorted(names))}: rename one"
         for name, axis in self.grid.items():
             if name == BASE:
                 yield ("grid", BASE), "several configurations are listed under base"
             if axis.keys == ("",) and name in self.random:
-                yield ("random", name), "stands in the grid as well; keep one"
+                yield ("random", name), "is in the grid as well; keep one"
             if len({json.dumps(value) for value in axis.values}) < len(axis.values):
-                yield ("grid", name), "a value stands there twice"
+                yield ("grid", name), "a value occurs there twice"
         yield from self._replaced()
 
     def _replaced(self) -> Iterator[Note]:

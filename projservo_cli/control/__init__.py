@@ -1,4 +1,4 @@
-"""Control laws: those of the paper, one without drift, and classical ones, behind one function.
+"""Control laws: the laws of the paper, one without drift, and classical ones, behind one function.
 
 Run files and tables know a law by its name, compiled code by its code in ``laws``.
 """
@@ -115,7 +115,7 @@ def _prepared(model: Model, task: Task, gains: Gains, s: FloatArray, state: Stat
 
 @merged
 def _finished(task: Task, gains: Gains, q: FloatArray, status: int, limited: bool, state: State) -> int:
-    """Advance along the plan by what the law commanded, if there is one; the status.
+    """Advance along the plan by the command of the law, if there is one; the status.
 
     limited : whether the law applies the joint-speed limit.
     """
@@ -133,7 +133,7 @@ def _keep_near(reference: Reference, gains: Gains, q: FloatArray, unique: bool, 
 
     Images correct by a share of the law's command, which amplifies noise near a singularity.
 
-    unique : whether the law found a joint motion; else the joints follow the path alone.
+    unique : whether the law found a joint motion; otherwise the joints follow the path alone.
     """
     for i in range(q.shape[0]):
         step = state.q_ahead[i]
@@ -149,7 +149,7 @@ def _keep_near(reference: Reference, gains: Gains, q: FloatArray, unique: bool, 
 def _go_on(reference: Reference, gains: Gains, status: int, limited: bool, state: State) -> None:
     """Advance the plan by the share of a period that the joint-speed limit leaves of the step.
 
-    limited : whether the law applied the limit; else this function does.
+    limited : whether the law applied the limit; otherwise this function does.
     """
     if status != OK:
         return

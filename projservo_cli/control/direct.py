@@ -1,4 +1,4 @@
-"""Direct control laws: those of the paper, and one without drift.
+"""Direct control laws: the laws of the paper, and one without drift.
 
 directTHREE moves by a translation and two rotations, directTWO by a translation and one. The paper leaves
 open how to keep the centre on its line with finite joint steps. The exact law solves the desired
@@ -40,7 +40,7 @@ _PART_STEP = math.radians(2.5)
 _ROUND_OFF = 1e-13
 # Bisections of a step until its end is at a limit, below round-off of a joint reading.
 _HALVINGS = 48
-# Share of the joint-speed limit aimed at where a solved step is beyond it: joint motion is not quite
+# Share of the joint-speed limit aimed at if a solved step is beyond it: joint motion is not quite
 # proportional to the amplitude.
 _AIM = 0.999
 # Length of a part over its prediction above which it is on another kinematic branch.
@@ -51,7 +51,7 @@ _BRANCH_FACTOR = 2.0
 def direct(
     code: int, model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, state: State
 ) -> int:
-    """Joint velocity of directTHREE or directTWO by the code, plus that of a plan."""
+    """Joint velocity of directTHREE or directTWO by the code, plus the velocity of a plan."""
     status, parts = partitioned(model, task, s, q, state)
     if status != OK:
         return status
@@ -189,7 +189,7 @@ def _solved(model: Model, task: Task, gains: Gains, q: FloatArray, step: _Step, 
 
 @merged
 def _blocked_joint(q: FloatArray, q_next: FloatArray, gains: Gains) -> int:
-    """First joint that a motion from q to q_next moves beyond a limit, or farther beyond it; else −1."""
+    """First joint that a motion from q to q_next moves beyond a limit, or farther beyond it; otherwise −1."""
     for i in range(q.shape[0]):
         if q_next[i] > max(q[i], gains.limits.upper[i]) or q_next[i] < min(q[i], gains.limits.lower[i]):
             return i
@@ -231,10 +231,10 @@ def exact(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, 
     The joint-speed limit shortens the amplitude along the path: by the first-order joint step, before any
     Newton step, then by the solved one. A position limit ends the step on it: the path itself never changes.
     Long steps are solved in parts of about 2.5°, or if a part fails in more, up to 128. Across a singularity,
-    where no part can be solved, the law takes the first-order step. Where every command is scaled, that share
-    of the displacement is solved, since that of the joint step would leave the path.
+    if no part can be solved, the law takes the first-order step. If every command is scaled, that share
+    of the displacement is solved, since the displacement of the joint step would leave the path.
 
-    With a plan, the displacement is that of the plan in the next period after the correction of the face.
+    With a plan, the displacement is taken from the plan in the next period after the correction of the face.
     Along a joint-space path the joints of the plan lead, and the first-order correction is added.
 
     Source: [RH00] eqs. (22), (23) as corrected, solved for the joint step through eq. (6).
@@ -256,7 +256,7 @@ def exact(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, 
         return OK
     share, seconds = speed_share(state.q_dot, gains.limits.speed, gains.period), gains.period * gains.scale
     if share < 1.0:
-        # One Newton step tells how far the solved step is beyond the limit.
+        # One Newton step estimates how far the solved step exceeds the limit.
         step = _scaled(whole, share * gains.scale, 1)
         _first_order(step, state)
         _continued(model, task, q, step, math.inf, state)

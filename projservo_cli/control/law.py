@@ -98,10 +98,10 @@ class Gains(NamedTuple):
 class Law(NamedTuple):
     """A built-in law with its inputs."""
 
-    code: int  # of the law
-    address: int  # of its compiled function, in this process
+    code: int  # code of the law
+    address: int  # address of its compiled function, in this process
     model: Model  # calibrated or metric
-    task: Task  # in the frame of the model
+    task: Task  # task in the frame of the model
     gains: Gains
 
 
@@ -188,7 +188,7 @@ def example() -> tuple[int, Model, Task, Gains, FloatArray, FloatArray, State]:
         F=np.zeros((3, 3)),
         O=np.zeros((2, 4)),
         visible=q,
-        least_views=2,
+        min_views=2,
     )
     gains = Gains(*(1.0,) * 8, limits=JointLimits(q, q, q, q))
     return 0, model, task, gains, task.s_star, q, new_state(4, 4)
@@ -247,8 +247,8 @@ def measure(model: Model, task: Task, s: FloatArray, q: FloatArray, state: State
 def _measure_body(model: Model, task: Task, s: FloatArray, H: Mat4, state: State) -> bool:
     """Measure the face by all markers of the body, predicted at the displacement H of the joints.
 
-    At the goal the errors of the calibration cancel if the fit has the same views as that of the goal image;
-    it uses others only if these do not determine the body.
+    At the goal the errors of the calibration cancel if the fit has the same views as the fit of the goal
+    image; it uses others only if these do not determine the body.
     """
     state.face_px[0] = math.nan
     fit = fit_body(model.P, task.body, s, H, GOAL_VIEWS, state.normal)
@@ -339,7 +339,7 @@ def _axis_direction(H_s: Mat4, a_inf: FloatArray, A_c: Vec4) -> Vec4:
     """Point at infinity on the axis of a rotation about the centre, of unit norm.
 
     (I + Ĥ²) X is the foot of X on the axis; the four coordinate vectors X less the centre give multiples of
-    one direction, of which the longest is the most accurate.
+    one direction, of which the longest has the highest accuracy.
     """
     H_s2 = mul(H_s, H_s)
     weights = vec(a_inf)
@@ -362,7 +362,7 @@ def single_rotation(
 ) -> tuple[bool, float, float, Mat4]:
     """Both rotations of a partition as one about the centre, [RH00] eqs. (23)–(25) as corrected.
 
-    The joint motion q̂_s with Σ q̂_si Ĥ_i = Ĥ_s is that of eq. (9) about the axis of Ĥ_s, at unit rate.
+    The joint motion q̂_s with Σ q̂_si Ĥ_i = Ĥ_s is given by eq. (9) about the axis of Ĥ_s, at unit rate.
     For λ_r/λ_p = ρ ≠ 1 the rotations composed in (24) are θ_r and θ_p weighted by ρ/max(1, ρ) and
     1/max(1, ρ): each then decays at its own rate, and the axis of the single rotation changes.
 
@@ -389,7 +389,7 @@ def view_into(model: Model, task: Task, s: FloatArray, state: State, view: int, 
 
     Rows of a marker that it does not show, now or at the goal, are zero. Returns how many it shows.
     """
-    shown = 0
+    n_views = 0
     system, operators = state.work.system, state.work.columns
     for i in range(operators.shape[0]):
         operator = mat(operators[i])
@@ -406,14 +406,14 @@ def view_into(model: Model, task: Task, s: FloatArray, state: State, view: int, 
             u, v = undistort_pixel(model.lens[view], float(target[0]), float(target[1]))
         e_u, e_v = s[view, k, 0] - u, s[view, k, 1] - v
         if math.isfinite(e_u + e_v):
-            shown += 1
+            n_views += 1
         else:
             e_u = e_v = 0.0
             for i in range(operators.shape[0]):
                 system.B[i, first + 2 * k] = system.B[i, first + 2 * k + 1] = 0.0
         system.rhs[first + 2 * k] = e_u
         system.rhs[first + 2 * k + 1] = e_v
-    return shown
+    return n_views
 
 
 @internal

@@ -90,7 +90,7 @@ def unit(A: Vec4) -> Vec4:
 
 @inline
 def mul(A: Mat4, B: Mat4) -> Mat4:
-    """Product A B, whose rows are those of A times B."""
+    """Product A B, whose rows are the rows of A times B."""
     upper = apply_transposed(B, A[0:4]) + apply_transposed(B, A[4:8])
     return upper + apply_transposed(B, A[8:12]) + apply_transposed(B, A[12:16])
 

@@ -1,4 +1,4 @@
-"""Displacements of projective space: exponentials of operators, their composition and what they preserve.
+"""Displacements of projective space: exponentials of operators, their composition and invariants.
 
 [RH00] eqs. (2), (4), (5), (24), (25). Kernels take plain values, one displacement at a time; the functions
 below them whole arrays.
@@ -124,7 +124,7 @@ def exp_rotation(H_hat: FloatArray, theta: float) -> FloatArray:
 def normalize_displacement(H: FloatArray, A: FloatArray, a_inf: FloatArray) -> FloatArray:
     """Scale a 4×4 homography to a displacement with det H = 1, [RH00] eq. (2).
 
-    The determinant leaves ±H (4, 4); the sign keeps that of a_inf·A for points A (..., 4).
+    The determinant leaves ±H (4, 4); the sign is kept of a_inf·A for points A (..., 4).
 
     Raises WorkFailed if det H is not positive, since H is then no displacement.
     """
@@ -275,7 +275,7 @@ def invariant_rotations(actions: FloatArray) -> FloatArray:
     The metric is the symmetric Q with LᵀQ + QL = 0 for every action L (n, 3, 3) of a joint on that plane. If
     few joints leave it open, it is the one nearest to the identity, which serves these joints as well.
     ``metric.frame.invariant_upgrade`` takes no such joints, but many calibrations at once. Its last bits
-    decide signs of what a calibration leaves open, and those here the joint steps near a singularity.
+    decide signs that a calibration leaves open, and those here the joint steps near a singularity.
 
     Raises WorkFailed if the joints preserve no metric.
     """

@@ -90,7 +90,7 @@ def cache_folder(root: Path) -> Path | None:
     return folder
 
 
-# Maximum time that a function is waited for, s: several times that of the largest.
+# Maximum waiting time for a function, s: several times the time of the largest.
 _MOST_S = 120.0
 # Settings of Numba, attributes made at run time that its types do not list.
 SETTINGS: Any = numba.config
@@ -122,7 +122,7 @@ class _PlaceInPackage(UserProvidedCacheLocator):
 
     @classmethod
     def get_suitable_cache_subpath(cls, py_file: str) -> str:
-        """Return the folder below that of the cache."""
+        """Return the subfolder of the cache."""
         return "_".join(Path(py_file).parent.relative_to(PACKAGE).parts)
 
 
@@ -177,7 +177,7 @@ def _uncollected() -> Iterator[None]:
 class _Shared(CPUDispatcher):
     """A compiled function that two processes never compile at the same time: one waits and loads it."""
 
-    separate: Any = None  # what compiled code calls in its place, if not a copy
+    separate: Any = None  # function that compiled code calls in its place, if not a copy
 
     @property
     def _numba_type_(self) -> Any:
@@ -189,16 +189,16 @@ class _Shared(CPUDispatcher):
         return context.resolve_value_type(self.separate)
 
     def compile(self, sig: Any) -> Any:
-        """Compile the function for a signature, or load what another process compiled."""
+        """Compile the function for a signature, or load it if another process compiled it."""
         if CACHE_FOLDER is None:
             return super().compile(sig)
         path = CACHE_FOLDER / f"{self.py_func.__module__}.{self.py_func.__qualname__}.lock"
         # Locks in this order, as where functions call others.
         with global_compiler_lock, _uncollected(), ExitStack() as held:
-            with suppress(OSError, NotImplementedError):  # no locks, or none for so long: both compile
+            with suppress(OSError, NotImplementedError):  # no locks, or a timeout: both compile
                 held.enter_context(FileLock(path, timeout=_MOST_S))
             entry = super().compile(sig)
-        # What has to be called before it runs, its callers have to call too: Numba forgets it as it loads.
+        # Its callers, too, have to call its prerequisites before it runs: Numba forgets them as it loads.
         for made in cast(Any, self).overloads.values():
             made.library._reload_init.update(made.reload_init)
         return entry
@@ -246,7 +246,7 @@ def _compiled(
 def inline(function: Callable[_Params, _Result]) -> Callable[_Params, _Result]:
     """Compile a helper that the optimiser merges into its callers; Python interprets it.
 
-    Interpreted, a function of few calls, as of the begin of a run, needs the machine code of what it calls
+    Interpreted, a function of few calls, as of the begin of a run, needs the machine code of its callees
     alone.
     """
     return internal(function, forceinline=True)
@@ -278,7 +278,7 @@ class _Separate:
         return f"{self.module}.{self.function}.{types}"
 
     def __call__(self) -> Any:
-        """Compile or load the function, define its symbol, and return what the compiler knows of it."""
+        """Compile or load the function, define its symbol, and return its record of the compiler."""
         function = getattr(import_module(self.module), self.function)
         if self.types not in function.overloads:
             function.compile(self.types)
@@ -294,10 +294,10 @@ def _address(made: Any) -> int:
 
 
 def separate(function: Callable[_Params, _Result]) -> Callable[_Params, _Result]:
-    """Let compiled code call a compiled function where it is, instead of a copy of its own.
+    """Let compiled code call a compiled function in place, instead of a separate copy.
 
     Machine code holds a copy of every function that it calls, and of all that these call, each optimised
-    again. That of a large function costs more time than the call; that of a small one in a loop does not.
+    again. A copy of a large function costs more time than the call; a copy of a small one in a loop does not.
 
     function : without default values.
     """
@@ -307,7 +307,7 @@ def separate(function: Callable[_Params, _Result]) -> Callable[_Params, _Result]
 
 
 def _caller(function: Any) -> Any:
-    """Return what compiled code calls in place of a function."""
+    """Return the function that compiled code calls in place of another."""
     own = signature(function.py_func)
 
     def call(typing_context: Any, *given: Any, **named: Any) -> Any:
@@ -315,13 +315,13 @@ def _caller(function: Any) -> Any:
         one = _Separate(function.py_func.__module__, function.py_func.__qualname__, types)
         made = one()
 
-        def lowered(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        def codegen(context: Any, builder: Any, signature: Any, values: Any) -> Any:
             kind = context.call_conv.get_function_type(signature.return_type, types)
             callee = _CODE.get_or_insert_function(builder.module, kind, one.symbol)
             context.active_code_library._reload_init.add(one)
             return _called(context, builder, callee, signature.return_type, types, values)
 
-        return made.signature, lowered
+        return made.signature, codegen
 
     stated: Any = call
     typing = Parameter("typing_context", Parameter.POSITIONAL_OR_KEYWORD)
@@ -376,12 +376,12 @@ class ByAddress:
             if arguments.types != self.types:
                 raise TypingError(f"called with {arguments.types}, compiled for {self.types}")
 
-            def lowered(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+            def codegen(context: Any, builder: Any, signature: Any, values: Any) -> Any:
                 kind = context.call_conv.get_function_type(signature.return_type, arguments.types)
                 callee = builder.inttoptr(values[0], kind.as_pointer())
                 unpacked = _CODE.unpack_tuple(builder, values[1])
                 return _called(context, builder, callee, signature.return_type, arguments.types, unpacked)
 
-            return numba.int64(address, arguments), lowered
+            return numba.int64(address, arguments), codegen
 
         return cast(Callable[..., int], call)

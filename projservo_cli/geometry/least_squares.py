@@ -12,7 +12,7 @@ import numpy as np
 
 from projservo_cli.records import BoolArray, FloatArray
 
-# Damping at first, least and most of all: none that is larger leads down where this one does not.
+# Damping at first, minimum and maximum: none that is larger leads down where this one does not.
 _AT_FIRST, _LEAST, _HOPELESS = 1e-3, 1e-9, 1e8
 # Fall of a cost by the last step, over the cost and as of round-off.
 _SETTLED, _EXACT = 1e-10, 1e-16
@@ -41,7 +41,7 @@ def levenberg_marquardt(
     steps: int,
     enough: float = _EXACT,
 ) -> tuple[tuple[FloatArray, ...], Equations]:
-    """Minima beside some states, and their equations; each state has a damping of its own.
+    """Minima near some states, and their equations; each state has its damping.
 
     x : arrays (S, …) that make up the states.
     equations : of such arrays.
@@ -71,7 +71,7 @@ def levenberg_marquardt(
 
 
 def _units(A: FloatArray) -> FloatArray:
-    """Second derivatives (S, p) that damping is in units of; the largest for what nothing shows."""
+    """Second derivatives (S, p) as units of the damping; the largest for unobserved parameters."""
     unit = np.diagonal(A, axis1=1, axis2=2)
     largest = unit.max(axis=1, keepdims=True, initial=0.0)
     return np.where(unit > _UNSEEN * largest, unit, np.where(largest > 0.0, largest, 1.0))

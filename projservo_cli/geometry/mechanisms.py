@@ -37,7 +37,7 @@ from projservo_cli.geometry.null_space import (
 )
 from projservo_cli.records import FloatArray, Model
 
-# Norm of an operator, over that of its terms, below which a kernel vector moves no point.
+# Norm of an operator, over the norm of its terms, below which a kernel vector moves no point.
 _NULL_MOTION = 1e-9
 # Operator returned with a failure.
 NO_OPERATOR: Mat4 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -48,7 +48,7 @@ SETTLED = 1e-8
 
 
 class Span(NamedTuple):
-    """Six operators that span all displacements; none if those of the joints do."""
+    """Six operators that span all displacements; none if the operators of the joints do."""
 
     H_hat: FloatArray  # (6, 4, 4) the operators, or (0, 4, 4)
     dual: FloatArray  # (6, 16) maps an operator, read row by row, to its coordinates
@@ -62,10 +62,10 @@ class Work(NamedTuple):
     """Workspaces of the compiled functions, which do not allocate."""
 
     H_hat: FloatArray  # (n, 4, 4) operators at the current joints
-    system: System  # of n unknowns, or of six
-    span: Span  # of an arm of n ≠ 6
-    basis: FloatArray  # operators that mechanisms combine: of the span, else ``H_hat`` itself
-    # independent operators for least squares: of the span if n > 6, else ``H_hat`` itself
+    system: System  # system of n unknowns, or of six
+    span: Span  # span of an arm of n ≠ 6
+    basis: FloatArray  # operators that mechanisms combine: of the span, otherwise ``H_hat`` itself
+    # independent operators for least squares: of the span if n > 6, otherwise ``H_hat`` itself
     columns: FloatArray
     J: FloatArray  # (6, n) coordinates of the operators in the span
     xi: FloatArray  # (6,) coordinates of a displacement

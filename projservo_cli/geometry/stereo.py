@@ -37,7 +37,7 @@ def triangulate(
     right pixel that is perpendicular to its epipolar line.
 
     P : (V, 3, 4) cameras; pair : (2,) views, the left and the right one; F : (3, 3) their fundamental matrix.
-    s : (V, m, 2) pixels, of which those of marker k are taken.
+    s : (V, m, 2) pixels, of which the pixels of marker k are taken.
     Returns false and zeros if the rays do not determine a finite point.
     """
     left, right = pair[0], pair[1]

@@ -55,16 +55,16 @@ class View(NamedTuple):
     """Tags in a frame."""
 
     frame: Frame
-    tags: dict[int, Corners]  # by their numbers
+    tags: dict[int, Corners]  # tags by their numbers
     repeated: tuple[int, ...]  # numbers that occur more than once
 
 
 class CameraRobot:
     """A robot of the contract: joints of an arm, and corners of tags in the newest frame of each camera.
 
-    numbers : of the markers, of which 4 t to 4 t + 3 are the corners of tag t; all are those of a board.
-    whole : whether the loss of one camera is that of the robot; else it goes on with the others.
-    ``view``: names of the cameras. ``views`` are those of the last frames, None before.
+    numbers : of the markers, of which 4 t to 4 t + 3 are the corners of tag t; or all corners of a board.
+    whole : whether the loss of one camera loses the robot; otherwise it goes on with the others.
+    ``view``: names of the cameras. ``views`` are the views of the last frames, None before.
     """
 
     def __init__(
@@ -109,7 +109,7 @@ class CameraRobot:
     def _newest(self, view: int) -> Frame | None:
         """Newest frame of a view; None while its camera is lost and others are not.
 
-        A camera is waited for when it is lost, and not again.
+        The robot waits for a lost camera once.
         """
         camera = self.cameras[view]
         if view in self._lost and not camera.runs:
@@ -126,7 +126,7 @@ class CameraRobot:
         return frame
 
     def _looked(self, view: int) -> View | None:
-        """Find tags in the newest frame of a view, unless that was done before; None where it is lost."""
+        """Find tags in the newest frame of a view, unless that was done before; None if it is lost."""
         frame, last = self._newest(view), self.views[view]
         if frame is None:
             return None
@@ -179,7 +179,7 @@ class CameraRobot:
             if self._begun:
                 self.arm.close()
         finally:
-            self._end_cameras()  # all, before any is waited for
+            self._end_cameras()  # end all before waiting for any
             for camera in self.cameras:
                 camera.close()
 
@@ -199,10 +199,10 @@ class _Exposure(NamedTuple):
     mean: float  # grey value
     brightest: float  # grey value
     clipped: float  # share of pixels that are white
-    blur_px: float  # standard deviation of the blur of its sharpest edges; NaN where it has none
+    blur_px: float  # standard deviation of the blur of its sharpest edges; NaN if it has none
 
     def faults(self, view: str) -> Iterator[Finding]:
-        """Yield what is wrong with the frame of a view; nothing for a sound one."""
+        """Yield the errors of the frame of a view; none for a sound one."""
         where = Subject(views=(view,))
         if self.brightest < _DARK:
             yield Finding("black_image", REFUSES, where, self.brightest, limit=_DARK)

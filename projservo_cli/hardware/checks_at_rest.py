@@ -16,7 +16,7 @@ from projservo_cli.records import CORNERS, BoolArray, ByteArray, FloatArray, Joi
 
 # Width of a cell, px, from which corners are good.
 _GOOD_CELL = 4.0
-# Frames a second, as a share of those asked for, below which a camera is slow; those of webcams by day, 1/s.
+# Frame rate, as a share of the requested one, below which a camera is slow; rate of webcams by day, 1/s.
 _SLOW, _USUAL_HZ = 0.75, 30.0
 # Angle between the directions from which two cameras see a tag, rad: depth errors grow with its inverse.
 _MIN_ANGLE, _GOOD_ANGLE = math.radians(4.0), math.radians(10.0)
@@ -40,23 +40,23 @@ class RobotAtRest:
     s: FloatArray  # (V, m, 2) mean of the pixels, NaN where most frames do not show a marker
     sigma: FloatArray | None  # (V, m) deviation of a corner of one frame as the detector states it, px
     scatter: FloatArray  # (V, m) between frames, px
-    shown: Observation  # the frames
+    frames: Observation  # the frames
     fresh: BoolArray  # (K, V) which of them are new
     limits: JointLimits
-    units: Sequence[str]  # of the joints: deg, rad or m
+    units: Sequence[str]  # units of the joints: deg, rad or m
     views: Sequence[View] = ()  # the last one of each camera of projservo
     cameras: Sequence[VideoCamera] = ()
     health: Mapping[str, float | str] = field(default_factory=dict)  # such as the voltage
 
     def of_views(self, names: tuple[str, ...]) -> "RobotAtRest":
-        """Return what some cameras show; raises InputError if there is none of a name."""
-        shown, rows = of_views(self.shown, names), [self.shown.view.index(name) for name in names]
+        """Return the check of some cameras; raises InputError if there is none of a name."""
+        frames, rows = of_views(self.frames, names), [self.frames.view.index(name) for name in names]
         return replace(
             self,
             s=self.s[rows],
             sigma=None if self.sigma is None else self.sigma[rows],
             scatter=self.scatter[rows],
-            shown=shown,
+            frames=frames,
             fresh=self.fresh[:, rows],
             views=[self.views[v] for v in rows] if self.views else (),
             cameras=[self.cameras[v] for v in rows] if self.cameras else (),
@@ -73,7 +73,7 @@ def findings_at_rest(
 ) -> Iterator[Finding]:
     """All findings at rest.
 
-    dictionary : name of that of the ``finder``; moves : whether joints are to move next, which need limits.
+    dictionary : name of the ``finder``'s; moves : whether joints are to move next, which need limits.
     """
     for camera, view in zip(robot.cameras, robot.views, strict=True):
         yield from _of_camera(camera)
@@ -177,9 +177,9 @@ def _of_all_views(robot: RobotAtRest) -> Iterator[Finding]:
     visible = np.isfinite(robot.s[..., 0])
     in_two: BoolArray = visible.sum(axis=0) >= min(2, len(visible))
     shared, total = int(in_two.sum()), len(robot.marker)
-    least = Finding("share", amount=MIN_SHARED, unit="1")
+    min_share = Finding("share", amount=MIN_SHARED, unit="1")
     if visible.any(axis=1).all() and shared < MIN_SHARED:
-        yield Finding("few_shared", REFUSES, amount=shared, limit=total, unit="1", others=(least,))
+        yield Finding("few_shared", REFUSES, amount=shared, limit=total, unit="1", others=(min_share,))
     elif shared:
         yield Finding("shared_markers", NOTE, amount=shared, limit=total, unit="1")
     shared_numbers = {number for k, number in enumerate(robot.marker) if in_two[k]}
@@ -205,7 +205,7 @@ def _of_all_views(robot: RobotAtRest) -> Iterator[Finding]:
 def _view_angle(left: Mapping[int, Corners], right: Mapping[int, Corners]) -> float:
     """Angle between the directions from which cameras see tags, rad, median over tags; NaN without one.
 
-    Tags whose perspective does not show to which side they are tilted count where there are no others; of the
+    Tags whose perspective does not show to which side they are tilted count if there are no others; of the
     sides that fit them the nearer ones are taken.
     """
     sure, unsure = list[float](), list[float]()
@@ -265,5 +265,5 @@ def _of_joints(robot: RobotAtRest, endless: str) -> Iterator[Finding]:
             yield replace(one, code="joint_at_limit", severity=LIMITS, others=limits)
     for name, value in robot.health.items():
         amount = value if isinstance(value, float) else math.nan
-        told = f"{value:.4g}" if isinstance(value, float) else value
-        yield Finding("health", NOTE, Subject(name=f"{name} {told}"), amount)
+        value_text = f"{value:.4g}" if isinstance(value, float) else value
+        yield Finding("health", NOTE, Subject(name=f"{name} {value_text}"), amount)

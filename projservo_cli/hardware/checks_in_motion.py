@@ -19,12 +19,12 @@ from projservo_cli.robots.pacing import Steered
 _REACH, _QUICK, _SLOW = math.radians(3.0), math.radians(20.0), math.radians(5.0)
 # Minimum motion from one end to the other, rad, and distance kept from limits.
 _LEAST_WAY, _KEPT = math.radians(2.0), math.radians(0.5)
-# Pause after each stroke, s, and the part at its end in which all stands still.
+# Pause after each stroke, s, and the part at its end in which all is at rest.
 _PAUSE_S, _STILL_S = 0.6, 0.3
-# Share of strokes that a joint must go, else something holds it: hysteresis takes much of the first one, and
+# Share of strokes that a joint must go, otherwise it is stuck: hysteresis takes much of the first one, and
 # of those to the middle.
 _HELD = {0: 0.1, 1: 0.4, 2: 0.4, 3: 0.4}
-# Motion after a turn of direction within which backlash is passed, rad: at first, and where more shows.
+# Motion after a turn of direction within which backlash is passed, rad: at first, and if more shows.
 _PASSING, _MAX_PASSING = math.radians(1.4), math.radians(2.6)
 # Motion back that counts as a turn of direction, rad.
 _TURN = math.radians(0.35)
@@ -87,7 +87,7 @@ _UP, _DOWN, _FROM_BELOW, _FROM_ABOVE = 4, 5, 6, 8
 
 
 def strokes(steered: Steered, joint: int) -> Strokes | Finding:
-    """Move a joint to and fro about where it stands; a finding where it has no room for that.
+    """Move a joint to and fro about its present position; a finding if it has no room for that.
 
     steered : the robot, one for all joints: each set-point that begins at a reading lets an arm sag further.
     """
@@ -117,8 +117,8 @@ def strokes(steered: Steered, joint: int) -> Strokes | Finding:
             rows.append((number, float(steered.target[joint]) / unit, steered.observe()))
         way, gone = abs(goal - begun), abs(float(steered.reading.q[joint]) - from_q)
         if number in _HELD and gone < _HELD[number] * way:
-            held = Finding("held_joint", REFUSES, subject, gone, limit=way, unit=_name(slides))
-            return Strokes(joint, slides, *_columns(rows), held)
+            stuck = Finding("held_joint", REFUSES, subject, gone, limit=way, unit=_name(slides))
+            return Strokes(joint, slides, *_columns(rows), stuck)
     return Strokes(joint, slides, *_columns(rows))
 
 
@@ -158,7 +158,7 @@ class _Fit(NamedTuple):
 
 
 def _fit(moved: Strokes, signal: _Signal, passing: float) -> _Fit | None:
-    """Fit p(t) = c± + b q(t − d) + e q(t − d)², c+ where the joint went up last, else c−; None for no motion.
+    """Fit p(t) = c± + b q(t − d) + e q(t − d)², c+ if the joint went up last, or c−; None for no motion.
 
     passing : motion, rad, after a turn of direction, that passes the backlash: frames there do not count.
     """
@@ -220,7 +220,7 @@ def findings_of(
     numbers : of the markers; view : names of the views.
     """
     still, total = [], np.zeros((len(view), len(_LATENCIES)))
-    most = np.zeros(len(view))  # motion of each image, px
+    max_px = np.zeros(len(view))  # motion of each image, px
     for trial in moved:
         signals = [_signal(trial, v) for v in range(len(view))]
         fits = [_passed(trial, signal) for signal in signals]
@@ -228,7 +228,7 @@ def findings_of(
             yield trial.given_up
             continue
         spans = [np.ptp(signal.p) if len(signal.p) else 0.0 for signal in signals]
-        most, span = np.maximum(most, spans), max(spans)
+        max_px, span = np.maximum(max_px, spans), max(spans)
         if span < _MOVES_PX:
             still.append(trial.joint)
         else:
@@ -237,14 +237,14 @@ def findings_of(
         yield _of_servo(trial, [fit for fit in fits if fit is not None] if span >= _MOVES_PX else [])
     if still:
         yield _of_still(still, len(moved))
-    for name, squares, px in zip(view, total, most, strict=True):
-        if px < _MOVES_PX <= most.max():
+    for name, squares, px in zip(view, total, max_px, strict=True):
+        if px < _MOVES_PX <= max_px.max():
             yield Finding("still_image", REFUSES, Subject(views=(name,)), px, limit=_MOVES_PX, unit="px")
         elif squares.any():
             latency = _minimum(squares)
             code, level = ("long_latency", LIMITS) if latency > _MAX_LATENCY_S else ("latency", NOTE)
             yield Finding(code, level, Subject(views=(name,)), latency, limit=_MAX_LATENCY_S, unit="s")
-    if most.max() >= _MOVES_PX:
+    if max_px.max() >= _MOVES_PX:
         yield from _of_loose_tags(moved, numbers)
 
 

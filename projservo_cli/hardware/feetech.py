@@ -17,10 +17,10 @@ from projservo_cli.records import InputError, WorkFailed
 BAUD = 1_000_000
 # Bytes of memory that can be read.
 _MEMORY = 86
-# Fewest bytes that a request reads, and how many lengths there are, one after the other: those of as many
+# Fewest bytes that a request reads, and how many lengths there are, one after the other: for as many
 # failed requests take 0.14 s, and no reply is later.
 _SHORTEST, _LENGTHS = 15, 12
-_HEAD = 4  # bytes of a reply before its status: fewer may be noise of a line that nobody drives
+_HEAD = 4  # bytes of a reply before its status: fewer may be noise of an undriven line
 # Time within which replies come, s, at first and at most: the bytes of six servos and their delays take 3 ms,
 # adapters and busy machines more.
 _REPLY_S, _SLOW_S = 0.012, 0.1
@@ -30,7 +30,7 @@ _PATIENCE_S = 0.8
 _PAUSE_S, _WRITTEN_S = 0.0002, 0.005
 # How often a write is repeated that a servo does not take.
 _WRITES = 5
-# Instructions, and the number that stands for all servos.
+# Instructions, and the number that addresses all servos.
 _SYNC_READ, _SYNC_WRITE, _ALL = 0x82, 0x83, 0xFE
 
 
@@ -42,7 +42,7 @@ class _Reply(NamedTuple):
 
 
 class ServoSilent(WorkFailed):
-    """Servos that do not answer, or, where ``garbled``, of which what arrives is no reply."""
+    """Servos that do not answer, or, if ``garbled``, whose bytes are no reply."""
 
     def __init__(self, silent: Sequence[int], garbled: Sequence[int] = ()) -> None:
         self.silent, self.garbled = tuple(silent), tuple(garbled)
@@ -59,7 +59,7 @@ class PortLost(WorkFailed):
 
 
 class FeetechBus:
-    """A port with servos; an InputError where it cannot be opened. ``now``, ``sleep``: the clock, s."""
+    """A port with servos; an InputError if it cannot be opened. ``now``, ``sleep``: the clock, s."""
 
     def __init__(self, port: str, now: Any = time.monotonic, sleep: Any = time.sleep) -> None:
         self.port, self.now, self.sleep = port, now, sleep
@@ -74,7 +74,7 @@ class FeetechBus:
     def read(
         self, ids: Sequence[int], address: int, size: int, *, together: bool = False
     ) -> dict[int, _Reply]:
-        """Return so many bytes, 15 at most, of the memory of each servo; silent ones are asked again.
+        """Return a number of bytes, 15 at most, of the memory of each servo; silent ones are asked again.
 
         together : all are asked again, so that all replies are of ``read_at``.
         Raises ServoSilent, or PortLost.
@@ -98,7 +98,7 @@ class FeetechBus:
             self._send(_SYNC_WRITE, bytes([address, size]) + rows)
 
     def store(self, address: int, values: Mapping[int, bytes]) -> None:
-        """Write bytes until they are read back; WorkFailed where a servo does not take them."""
+        """Write bytes until they are read back; WorkFailed if a servo does not take them."""
         for _ in range(_WRITES):
             if not values:
                 return
@@ -113,7 +113,7 @@ class FeetechBus:
             )
 
     def _asked(self, ids: Sequence[int], address: int, size: int) -> tuple[dict[int, _Reply], set[int]]:
-        """Replies to one request by servo, and those of which there is none, but bytes that are no reply."""
+        """Replies to one request by servo, and servos that sent only bytes that are no reply."""
         with self._lock:
             longer = _SHORTEST + self._failed % _LENGTHS
             start = min(address, _MEMORY - longer)
@@ -121,9 +121,9 @@ class FeetechBus:
             sent = self._send(_SYNC_READ, bytes([start, longer, *ids]))
             answered: dict[int, _Reply] = {}
             before = self.now()
-            heard, end, late = b"", before + self._reply_s, False
-            while len(answered) < len(ids) and not late:
-                late = self.now() >= end  # then once more: on a busy machine replies wait to be read
+            heard, end, timed_out = b"", before + self._reply_s, False
+            while len(answered) < len(ids) and not timed_out:
+                timed_out = self.now() >= end  # then once more: on a busy machine replies wait to be read
                 heard += self._received()
                 for number, status, values in _packets(heard):
                     if number in ids and len(values) == longer:
@@ -150,10 +150,10 @@ class FeetechBus:
         return b""
 
     def _checked(self, call: Callable[..., Any], *arguments: Any) -> Any:
-        """Call the port; PortLost where it is gone."""
+        """Call the port; PortLost if it is gone."""
         try:
             return call(*arguments)
-        except Exception as error:  # of another kind on each system
+        except Exception as error:  # another class on each system
             raise PortLost(f"port {self.port} is gone: look at its USB cable ({error})") from error
 
 

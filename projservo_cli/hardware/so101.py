@@ -42,7 +42,7 @@ _FAULTS = {
     0x08: "servo_current",
     _OVERLOADED: "servo_overload",
 }
-# Fastest that somebody turns a joint, or a servo does, rad/s, and what readings scatter, rad; more is no
+# Maximum speed of a joint turned by hand or servo, rad/s, and scatter of readings, rad; more is no
 # reading.
 _FASTEST, _SCATTER = math.radians(720.0), math.radians(1.0)
 # Factor by which a servo may outrun set-points, so that it catches up; and speed limit of the gripper, rad/s.
@@ -50,7 +50,7 @@ _CATCHES_UP, _GRIPPER = 1.5, math.radians(60.0)
 _GRIPS_S = 0.3  # after which a gripper has closed or opened, s
 # Repetitions of a reading that cannot be true, or reports a fault.
 _REPEATS = 4
-# How far a joint may turn while its torque comes on, be beyond a limit, or lag where it stands, rad.
+# How far a joint may turn while its torque comes on, be beyond a limit, or lag at rest, rad.
 _LEAP = math.radians(3.0)
 _SWITCH_S = 0.1  # after which torque has come on
 
@@ -84,8 +84,8 @@ class Servos:
 
     port : its name; ``auto`` for the only one on which all of them answer.
     ids : of the joints, base to tool; others : of further servos, such as a gripper.
-    whole : whether all must answer; else some may be lost.
-    Raises InputError where the port cannot be opened, servos are missing, or are of another kind.
+    whole : whether all must answer; otherwise some may be lost.
+    Raises InputError if the port cannot be opened, servos are missing, or are of another kind.
     """
 
     def __init__(
@@ -115,7 +115,7 @@ class Servos:
                 return self._first(whole)
             if error.garbled and there:
                 raise InputError(
-                    f"{where} answers of servo {error.garbled[0]} are garbled, those of {there} are not: "
+                    f"{where} answers of servo {error.garbled[0]} are garbled, answers of {there} are not: "
                     "two servos have this id, or its cable is loose: look at it, or unplug one and set its id"
                 ) from error
             if error.garbled:
@@ -153,7 +153,7 @@ class Servos:
         return Subject(joints=joints, name=f"servo {number}")
 
     def measured(self) -> dict[int, _Measured]:
-        """Return what each servo measures that is not lost."""
+        """Return the measurements of each servo that is not lost."""
         replies = self.bus.read(self.alive, _PRESENT, 8, together=True).items()
         return {i: _Measured(_number(x), 0.1 * x[6], x[7], status) for i, (status, x) in replies}
 
@@ -180,7 +180,7 @@ class Servos:
         self.bus.write(_GOAL, _goals({i: x for i, x in counts.items() if i not in self.lost}, speed))
 
     def enable(self, counts: Mapping[int, int], speed: Mapping[int, int]) -> None:
-        """Have servos hold where they stand, at these counts.
+        """Have servos hold their position, at these counts.
 
         The set-point is sent before torque comes on, since a servo else leaps to its last one.
         """
@@ -188,7 +188,7 @@ class Servos:
         self.bus.store(_TORQUE, dict.fromkeys(counts, b"\1"))
 
     def shift(self, number: int, by: int) -> None:
-        """Store an offset by which a servo reads so many counts less; its torque must be off."""
+        """Store an offset by which a servo reads ``by`` counts less; its torque must be off."""
         offset = max((self.registers()[number].offset + by + MIDDLE) % TURN - MIDDLE, 1 - MIDDLE)
         self.bus.store(_LOCK, {number: b"\0"})
         try:
@@ -197,7 +197,7 @@ class Servos:
             self.bus.store(_LOCK, {number: b"\1"})
 
     def failure(self, error: WorkFailed) -> Finding:
-        """Tell which joints may fall where the bus fails; nothing more is written to them."""
+        """Tell which joints may fall if the bus fails; nothing more is written to them."""
         lost = from_text(str(error), REFUSES)
         if not isinstance(error, ServoSilent):
             return replace(lost, code="lost_port")
@@ -214,11 +214,11 @@ class Servos:
 
 
 class SO101:
-    """An arm of bus servos, driven by the contract of robots; its images are those of ``cameras``.
+    """An arm of bus servos, driven by the contract of robots; its images come from ``cameras``.
 
     port : of the arm, such as /dev/ttyACM0; ``auto`` takes the only one on which all servos answer.
     ids : of the servos of the joints, base to tool.
-    gripper : that of the gripper, which is held; None for an arm without.
+    gripper : servo of the gripper, which is held; None for an arm without.
     gripper_counts : its readings closed and open; None for the limits that its servo keeps.
     limits : of its joints, rad and rad/s; without them the arm does not move.
     """
@@ -259,7 +259,7 @@ class SO101:
         self.registers: dict[int, Registers] = {}
 
     def connect(self, *, whole: bool = True) -> Servos:
-        """Connect to the servos, which no other process may have; ``whole`` where all must answer."""
+        """Connect to the servos, which no other process may have; ``whole`` if all must answer."""
         self._servos = Servos(
             self._port, self._ids, self._others, whole=whole, now=self.now, sleep=self.sleep
         )
@@ -271,12 +271,12 @@ class SO101:
         if self._lease.before:
             _say(
                 f"process {self._lease.before} was ended while it moved this arm: servos went on to their "
-                "last set-points; going on from where the arm stands"
+                "last set-points; going on from the present position"
             )
         return self._servos
 
     def open(self) -> None:
-        """Connect to the servos, and refuse those with which the arm would not stand where it is sent."""
+        """Connect to the servos, and refuse servos that would not reach their set-points."""
         self.connect()
         self._opened = True
         self.registers = self._servos.registers()
@@ -310,15 +310,15 @@ class SO101:
             self.hold()
         counts = {i: round(MIDDLE + float(q) / COUNT) for i, q in zip(self._ids, target, strict=True)}
         for i, count in counts.items():
-            least, most = self._keeps(i)
-            if not least <= count <= most:
-                kept = (Finding("range", amount=least, limit=most, unit="1"),)
+            low_count, high_count = self._keeps(i)
+            if not low_count <= count <= high_count:
+                kept = (Finding("range", amount=low_count, limit=high_count, unit="1"),)
                 raise self._failed("set_point_beyond", i, count, unit="1", others=kept)
         self._servos.send(counts, self._speeds())
         self._sent |= counts
 
     def hold(self) -> None:
-        """Hold the arm where it stands; a gripper that holds keeps its grip."""
+        """Hold the arm in its position; a gripper that holds keeps its grip."""
         self._require_limits()
         self._lease.moving()
         grips = {i for i, on in self._servos.torque().items() if on and i in self._others}
@@ -338,7 +338,7 @@ class SO101:
     def act(self, name: str, value: float) -> float:
         """Open the gripper by a share, from 0, closed, to 1, and return how long that takes, s.
 
-        It pushes on at what is between its jaws, also when the arm is stopped or released.
+        It keeps pushing on the object between its jaws, also when the arm is stopped or released.
         """
         if name != "gripper" or not self._others:
             raise InputError(f"the arm has no {name}: give gripper, and its servo in plant.options.gripper")
@@ -352,14 +352,14 @@ class SO101:
                 "plant.options.gripper_counts to its readings closed and open"
             )
         count = round(closed + value * (opened - closed))
-        way = abs(count - self._read()[i].at) * COUNT
+        travel = abs(count - self._read()[i].at) * COUNT
         self._sent.pop(i, None)
         self._servos.enable({i: count}, self._speeds())
         self._grip = count, value
-        return way / _GRIPPER + _GRIPS_S
+        return travel / _GRIPPER + _GRIPS_S
 
     def holding(self, name: str) -> bool | None:
-        """Whether something keeps the gripper from where it was sent; None where it was not closed fully."""
+        """Whether something keeps the gripper from where it was sent; None if it was not closed fully."""
         if name != "gripper" or not self._others or self._grip is None:
             return None
         (i,) = self._others
@@ -401,14 +401,14 @@ class SO101:
         return self.registers[number].lowest, min(self.registers[number].highest, TURN - 1)
 
     def _speeds(self) -> dict[int, int]:
-        """Highest speed of each servo, counts/s, never 0, which stands for as fast as it can."""
+        """Highest speed of each servo, counts/s, never 0, which means full speed."""
         rates = dict.fromkeys(self._servos.all, _GRIPPER)
         if self._limits is not None:
             rates |= zip(self._ids, np.minimum(_CATCHES_UP * self._limits.speed, _FASTEST), strict=True)
         return {i: max(1, math.ceil(rate / COUNT)) for i, rate in rates.items()}
 
     def _require_limits(self) -> None:
-        """Refuse to move an arm without limits, or one that stands beyond them."""
+        """Refuse to move an arm without limits, or one beyond them."""
         if self._limits is None:
             raise InputError("nothing was moved: the arm has no limits: projservo limits -c FILE finds them")
         servos = self._read()
@@ -430,10 +430,10 @@ class SO101:
             raise InputError(f"{name}: it counts several turns (register 18 is {stored.phase}): set {wanted}")
         if self._limits is None:
             return
-        k, (least, most) = self._ids.index(number), self._keeps(number)
+        k, (low_count, high_count) = self._ids.index(number), self._keeps(number)
         low, high = self._limits.lower[k], self._limits.upper[k]
-        if not least <= round(MIDDLE + low / COUNT) < round(MIDDLE + high / COUNT) <= most:
-            kept = " to ".join(_deg((x - MIDDLE) * COUNT) for x in (least, most))
+        if not low_count <= round(MIDDLE + low / COUNT) < round(MIDDLE + high / COUNT) <= high_count:
+            kept = " to ".join(_deg((x - MIDDLE) * COUNT) for x in (low_count, high_count))
             raise InputError(
                 f"{name}: its limits, {_deg(low)} to {_deg(high)}, go beyond those that it keeps itself, "
                 f"{kept} (registers 9 and 11): run projservo limits again"
@@ -442,7 +442,7 @@ class SO101:
     def _read(self) -> dict[int, _Measured]:
         """Return the measurements of all servos; repeat an impossible reading, or one with a fault.
 
-        The first one counts where a second agrees with it.
+        The first one counts if a second agrees with it.
         """
         servos, wrong = dict[int, _Measured](), list[Finding]()
         for _ in range(_REPEATS):
@@ -462,13 +462,13 @@ class SO101:
 
     def _leapt(self, servos: Mapping[int, _Measured], seconds: float) -> Iterator[Finding]:
         """Yield the joints whose reading is impossible since the last one."""
-        most = _FASTEST * seconds + _SCATTER
+        high_count = _FASTEST * seconds + _SCATTER
         if self._on and self._limits is not None:
             fastest = 2.0 * _CATCHES_UP * max(_GRIPPER, float(self._limits.speed.max()))
-            most = min(_FASTEST, fastest) * seconds + _SCATTER
+            high_count = min(_FASTEST, fastest) * seconds + _SCATTER
         for i, servo in servos.items():
             before = self._before.get(i)
-            if servo.at >= TURN or (before is not None and abs(servo.at - before.at) * COUNT > most):
+            if servo.at >= TURN or (before is not None and abs(servo.at - before.at) * COUNT > high_count):
                 last = () if before is None else (Finding("last", amount=before.angle, unit="rad"),)
                 subject = self._servos.subject(i)
                 yield Finding("impossible_reading", REFUSES, subject, servo.angle, unit="rad", others=last)
@@ -477,8 +477,8 @@ class SO101:
         """Yield the faults that servos report."""
         for i, servo in servos.items():
             amounts = {"servo_supply": (servo.volts, "V"), "servo_heat": (servo.heat, "°C")}
-            least, most = self._servos.volts[i]
-            supply = (Finding("range", amount=least, limit=most, unit="V"),)
+            low_count, high_count = self._servos.volts[i]
+            supply = (Finding("range", amount=low_count, limit=high_count, unit="V"),)
             for bit, code in _FAULTS.items():
                 # The first set-point ends an overload of before.
                 pushes = bit == _OVERLOADED and (i in self._others or not self._on)  # as a grip does
@@ -490,7 +490,7 @@ class SO101:
 
 @contextmanager
 def connected(arm: SO101, *, whole: bool = True) -> Iterator[Servos]:
-    """Connect to the servos of an arm alone, which is not driven; ``whole`` where all must answer."""
+    """Connect to the servos of an arm alone, which is not driven; ``whole`` if all must answer."""
     servos = arm.connect(whole=whole)
     try:
         yield servos
@@ -500,7 +500,7 @@ def connected(arm: SO101, *, whole: bool = True) -> Iterator[Servos]:
 
 
 def torque_reported(servos: Servos) -> tuple[Finding, bool]:
-    """Report whether torque is on, at the end of whatever was done with an arm, and whether that is known."""
+    """Report whether torque is on, at the end of work with an arm, and whether that is known."""
     try:
         on = servos.torque()
     except (ServoSilent, PortLost):
@@ -514,7 +514,7 @@ def torque_reported(servos: Servos) -> tuple[Finding, bool]:
 
 
 class _Lease:
-    """The port of an arm, which one process has; and a note that outlives it where it ends in motion.
+    """The port of an arm, which one process has; and a note that outlives it if it ends in motion.
 
     ``before``: number of a process that was ended while it moved the arm; empty for none.
     """
@@ -559,7 +559,7 @@ class _Lease:
 def _port_of(ids: Sequence[int], **clock: Any) -> str:
     """Return the only port on which all servos answer; an InputError lists the ports, each with its obstacle.
 
-    A single port is the one: what is wrong with its servos is found later.
+    A single port is taken: errors of its servos are found later.
     """
     ports, fitting, obstacles = candidate_ports(), [], []
     if len(ports) == 1:

@@ -48,7 +48,7 @@ class _Line(NamedTuple):
     """A line of a net."""
 
     points: FloatArray  # (k, 2) mm
-    fold: bool  # whether to fold there, else to cut
+    fold: bool  # whether to fold there, otherwise to cut
 
 
 class _Net(NamedTuple):
@@ -57,7 +57,7 @@ class _Net(NamedTuple):
     tags: tuple[_FlatTag, ...]
     lines: tuple[_Line, ...]
     size: FloatArray  # (2,) width and height, mm
-    labels: tuple[tuple[str, FloatArray], ...]  # what stands where, mm
+    labels: tuple[tuple[str, FloatArray], ...]  # texts and their positions, mm
     fixed: FloatArray  # (2,) the part of the size that does not grow with the tags, mm
 
 
@@ -237,7 +237,7 @@ def pdf(figure: "Figure") -> bytes:
 
 
 def numbers_of(text: str) -> list[int]:
-    """Numbers of tags such as ``0-4,7``; an InputError where they are none, or one stands there twice."""
+    """Numbers of tags such as ``0-4,7``; an InputError if they are none, or one occurs twice."""
     numbers: list[int] = []
     for part in text.split(","):
         first, dash, last = part.strip().partition("-")
@@ -247,7 +247,7 @@ def numbers_of(text: str) -> list[int]:
     number, times = Counter(numbers).most_common(1)[0]
     if times > 1:
         raise InputError(
-            f"--numbers {text}: tag {number} stands there {times} times: name it once, since detect leaves "
+            f"--numbers {text}: tag {number} occurs {times} times: name it once, since detect leaves "
             "out a tag that an image shows twice"
         )
     return numbers

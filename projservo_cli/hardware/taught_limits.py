@@ -79,9 +79,9 @@ def _crosses(moved: _Moved) -> bool:
 
 
 def _kept_from(moved: _Moved, kept: Registers) -> Finding | None:
-    """Return how the limits that a servo stores cut the range of its joint; None where they hardly do.
+    """Return how the limits that a servo stores cut the range of its joint; None if they hardly do.
 
-    Those of a servo that is shifted must be those of a whole turn: its counts will mean other angles.
+    Limits of a shifted servo must span a whole turn: its counts will mean other angles.
     """
     cut = max(kept.lowest - moved.lowest, moved.highest - kept.highest)
     whole = kept.lowest <= 0 and kept.highest >= TURN - 1

@@ -31,7 +31,7 @@ class Frame(NamedTuple):
     """A frame of a camera."""
 
     grey: ByteArray  # (height, width)
-    t: float  # s, when it was taken: the stamp of its driver, else when it came
+    t: float  # s, when it was taken: the stamp of its driver, otherwise the arrival
     serial: int  # how many frames came up to it
 
 
@@ -43,9 +43,9 @@ _RETRY_S = 0.2
 _OPEN_MS, _READ_MS = 5000, 1000
 # Time within which the first frame must come: webcams settle their exposure, s.
 _FIRST_S = 8.0
-# Most time for which a closed camera is waited for, s: of a read, and most of an attempt to open.
+# Maximum wait for a closed camera, s: in a read, and in an attempt to open.
 _CLOSE_S = 3.0
-# What OpenCV says of a property that a driver does not have.
+# Value of OpenCV for a property that a driver does not have.
 _UNKNOWN = -1.0
 # Focus that common webcams round to, and half the steps of exposures that DirectShow has, powers of two.
 _FOCUS_STEP, _EXPOSURE_STEP = 5.0, 0.51
@@ -61,7 +61,7 @@ class VideoCamera:
     """A camera that is always grabbed.
 
     name : of it, such as ``left``. now : clock of the stamps, s.
-    ``remarks``: what its driver would not do.
+    ``remarks``: settings that its driver refused.
     """
 
     def __init__(
@@ -110,11 +110,11 @@ class VideoCamera:
             self.close()
             device = device_of(self.settings.source)
             holder = None if device is None else _holder(device, self._where)
-            late = Finding("no_frame", REFUSES, self._where, _FIRST_S, unit="s")
-            raise self._failed(self._refused or holder or late)
+            no_frame = Finding("no_frame", REFUSES, self._where, _FIRST_S, unit="s")
+            raise self._failed(self._refused or holder or no_frame)
 
     def newest(self) -> Frame:
-        """Newest frame, waited for while the camera reconnects; WorkFailed where that takes too long."""
+        """Newest frame, waited for while the camera reconnects; WorkFailed if that takes too long."""
         while True:
             frame = self._frame
             assert frame is not None
@@ -159,7 +159,7 @@ class VideoCamera:
             self._grabbing.join(_CLOSE_S)
 
     def _grab_always(self, capture: Any) -> None:
-        """Keep the newest frame until the camera is closed; connect again where it is lost."""
+        """Keep the newest frame until the camera is closed; connect again if it is lost."""
         while not self._closing.is_set():
             if capture is None:
                 try:
@@ -209,7 +209,7 @@ class VideoCamera:
             self._came.notify_all()
 
     def _stamp(self, capture: Any) -> float:
-        """When a frame was taken, s: V4L2 stamps buffers on the monotonic clock; else now."""
+        """When a frame was taken, s: V4L2 stamps buffers on the monotonic clock; otherwise now."""
         now = self._now()
         if self._now is not time.monotonic or device_of(self.settings.source) is None:
             return now
@@ -218,7 +218,7 @@ class VideoCamera:
         return stamp if self.stamped else now
 
     def _connected(self) -> Any:
-        """Open its source, and set what can be set; WorkFailed with the reason if it does not open."""
+        """Open its source, and apply its settings; WorkFailed with the reason if it does not open."""
         cv, source = _cv(), self.settings.source
         device = device_of(source)
         if device is not None:
@@ -256,7 +256,7 @@ def _cv() -> Any:
 
 
 def _set_up(capture: Any, settings: Source, where: Subject) -> Iterator[Finding]:
-    """Set format, size, rate, exposure and focus of a device; yield what it did not take."""
+    """Set format, size, rate, exposure and focus of a device; yield settings that it did not take."""
     cv = _cv()
     capture.set(cv.CAP_PROP_FOURCC, cv.VideoWriter.fourcc(*settings.fourcc))
     if settings.size_px is not None:
@@ -270,7 +270,7 @@ def _set_up(capture: Any, settings: Source, where: Subject) -> Iterator[Finding]
     focuses = settings.focus is None or capture.set(cv.CAP_PROP_FOCUS, settings.focus)
     v4l = capture.getBackendName() == "V4L2"
     exposes = settings.exposure_ms is None or _expose(capture, settings.exposure_ms, v4l)
-    # Drivers take settings without a word and keep their own: what they have afterwards counts.
+    # Drivers silently keep other settings: their values afterwards count.
     if v4l and (code := _code_of(capture.get(cv.CAP_PROP_FOURCC))) not in ("", settings.fourcc):
         asked = Finding("asked", subject=Subject(name=settings.fourcc))
         yield Finding("other_format", LIMITS, replace(where, name=code), others=(asked,))
@@ -304,18 +304,18 @@ def _expose(capture: Any, exposure_ms: float, v4l: bool) -> bool:
 
 
 def _code_of(number: float) -> str:
-    """Four letters of a format; empty where its driver does not say it."""
+    """Four letters of a format; empty if its driver does not say it."""
     code = struct.pack("<I", int(number)).decode("latin-1") if 0 < number < 2**32 else ""
     return code if code.isascii() and code.isprintable() else ""
 
 
 def _known_or_nan(value: float) -> float:
-    """Return the value that a driver tells; NaN where it does not say."""
+    """Return the value that a driver reports; NaN if it reports none."""
     return math.nan if value in (0, _UNKNOWN) else value
 
 
 def stable_name(source: int | str) -> str:
-    """Name of a device that stays when it is plugged in again; empty where there is none or it is given."""
+    """Name of a device that stays when it is plugged in again; empty if there is none or it is given."""
     device, links = device_of(source), Path("/dev/v4l/by-path")
     if device is None or str(source).startswith("/dev/v4l/") or not links.is_dir():
         return ""
@@ -372,7 +372,7 @@ def _devices(nodes: Sequence[Path]) -> tuple[Finding, ...]:
 
 
 def _holder(device: Path, where: Subject) -> Finding | None:
-    """Tell which other process has a device open; None where none of this user's shows."""
+    """Tell which other process has a device open; None if none of this user's shows."""
     for link in Path("/proc").glob("[0-9]*/fd/*"):
         number = int(link.parts[2])
         with contextlib.suppress(OSError):

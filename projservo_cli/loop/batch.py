@@ -36,8 +36,8 @@ from projservo_cli.task.target import body_task_into
 
 # A run that could not be begun; other verdicts as of ``step``.
 NOT_STARTED = -2
-# Columns of the numbers of a run: verdict, steps, those of its summary, and then, of each view, the times at
-# which its camera is behind the face.
+# Columns of the numbers of a run: verdict, steps, the numbers of its summary, and then, for each view, the
+# times at which its camera is behind the face.
 VERDICT, STEPS = range(2)
 NUMBERS = ("verdict", "steps", *Summary._fields)
 _NOT_OPENED = -1
@@ -46,17 +46,17 @@ _NOT_OPENED = -1
 class Setting(NamedTuple):
     """All that runs share which differ in their images alone; of a robot with six joints."""
 
-    code: int  # of the law
+    code: int  # code of the law
     model: Model  # calibrated, by which the task is partitioned
     believed: Model  # model of the law, the same or the metric one
-    body: Body  # with which the task is measured; none for point by point
+    body: Body  # body that measures the task; none for point by point
     shares_task: bool  # whether the law measures the task in the same way; it else does point by point
     rehearse: bool  # whether half turns are rehearsed
-    gains: Gains  # of the law
+    gains: Gains  # gains of the law
     course: Course  # true robot as the law observes it, from its first joints
     ends: Ends  # true poses of the tool
     pair: IntArray  # (2,) views from which the face is triangulated; none of one view
-    q_near: FloatArray  # (n,) joints near those of the goal, rad or m
+    q_near: FloatArray  # (n,) joints near the goal joints, rad or m
 
 
 class _Scratch(NamedTuple):
@@ -67,8 +67,8 @@ class _Scratch(NamedTuple):
     own_task: Task  # task, own_task: as partitioned, and as a law with other features sees it
     state: State
     own_state: State  # state, own_state: of the partition and of the law
-    log: Log  # of the run
-    address: int  # of the compiled law
+    log: Log  # log of the run
+    address: int  # address of the compiled law
 
 
 class Batch:
@@ -81,7 +81,7 @@ class Batch:
     def __init__(self, setting: Setting, images: int) -> None:
         plant, limits, q_start = setting.course
         n, m = len(q_start), len(plant.M)
-        V, pair, least = len(plant.O), setting.pair, plant.least_views
+        V, pair, least = len(plant.O), setting.pair, plant.min_views
         observed, s_star = m + len(plant.pins), np.zeros((V, m, 2))
         body = setting.body._replace(in_goal=np.zeros((V, len(setting.body.M)), dtype=np.bool_))
         self.setting = setting
@@ -102,7 +102,7 @@ class Batch:
         """Measure the task, partition it, drive the law to its verdict and sum up: (r, ``NUMBERS`` + V).
 
         images : (r, 2, V, b, 2) of each run at the start and at the goal, the face first, px.
-        noise : (r, k, V, m + p, 2) of the images of the loop, px; ``RUNNING`` is the verdict where it is too
+        noise : (r, k, V, m + p, 2) of the images of the loop, px; ``RUNNING`` is the verdict if it is too
             short.
         """
         numbers = np.full((len(images), len(NUMBERS) + images.shape[2]), math.nan)
@@ -128,7 +128,7 @@ def until_rehearsal(
     A call takes as long as a tenth of a run to hand its arguments over, and all of it with the lock of the
     interpreter held: hence many runs a call.
 
-    opened : verdict of the first run, which was opened; else ``_NOT_OPENED``.
+    opened : verdict of the first run, which was opened; otherwise ``_NOT_OPENED``.
     """
     for made in range(len(images)):
         status = opened

@@ -36,8 +36,8 @@ def run_compiled(law: Law, course: Course, noise: FloatArray, state: State, log:
     """Drive a law to its verdict.
 
     noise : (k, V, m + p, 2) added to the true pixels of the first k instants, px.
-    state, log : of this run alone; the log is filled up to the last instant, whatever it held before.
-    Returns verdict: code of the verdict; ``RUNNING`` where the noise ended before the run, which needs more
+    state, log : of this run alone; the log is filled up to the last instant, replacing its contents.
+    Returns verdict: code of the verdict; ``RUNNING`` if the noise ended before the run, which needs more
     of it to be redrawn; steps: commands sent; the log has one instant more.
     """
     plant, limits, q_start = course

@@ -8,7 +8,7 @@ from projservo_cli.laws import codes_of
 
 
 def compilation(names: Iterable[str] = ()) -> str:
-    """Whether kernels will have to be compiled, in words; empty where they are there or are not used.
+    """Whether kernels will have to be compiled, in words; empty if they are there or are not used.
 
     names : of the runs of laws that will be made.
     """

@@ -1,6 +1,6 @@
 """JIT warm-up: compile for the first run in other processes while one calibrates and plans.
 
-All share the work: what one compiles the others wait for and load.
+All share the work: each compiles a part, and the others wait and load it.
 """
 
 import sys
@@ -25,7 +25,7 @@ from projservo_cli.simulation.analytic_plant import Ends, Plant
 
 @contextmanager
 def compiling_in_background(codes: Collection[int]) -> Iterator[None]:
-    """Let two other processes compile meanwhile, where the loop or a law is not in the cache.
+    """Let two other processes compile meanwhile, if the loop or a law is not in the cache.
 
     codes : of the laws that will run.
     """
@@ -33,7 +33,7 @@ def compiling_in_background(codes: Collection[int]) -> Iterator[None]:
         yield
         return
     with ExitStack() as others:
-        # One begins at the loop and the other at the laws; what either has done, the other loads.
+        # One begins at the loop and the other at the laws; each loads the results of the other.
         for first, order in (("loop", -1), ("laws", 1)):
             call = f"warmup._compile({first!r}, {sorted(codes)[::order]})"
             command = [sys.executable, "-c", f"import {__name__} as warmup; {call}"]
@@ -48,7 +48,7 @@ def are_cached(codes: Collection[int]) -> bool:
 
 
 def _compile(first: str, codes: Collection[int]) -> None:
-    """Compile the ``loop`` or the ``laws`` of codes first, then the other, then what sums up a run."""
+    """Compile the ``loop`` or the ``laws`` of codes first, then the other, then the summary of a run."""
     kernels = [partial(kernel.compile, tuple(map(typeof, values))) for kernel, values in calls()]
     laws = [partial(address_of, code) for code in codes]
     loop, last = kernels[:2], kernels[2:]
@@ -70,7 +70,7 @@ def calls() -> Iterator[tuple[Any, tuple[Any, ...]]]:
         image_size=np.zeros((2, 2)),
         limits=limits,
         opaque=True,
-        least_views=2,
+        min_views=2,
     )
     log = new_log(4, 4, 1, len(ERRORS))
     reaching = Reaching(

@@ -5,13 +5,13 @@ Monitors end a run in this order. Each is given the verdict of those before it a
 1. the fault monitor holds the robot where images contradict the calibration, and ends the run once it is
    known why, before the law is asked;
 2. ``verdict_at``, which alone rules over the compiled loop too;
-3. the stall monitor, of a robot that may lag behind its set-points: it has ``converged`` once it stands,
-   and makes no progress where it stands still away from the goal;
+3. the stall monitor, of a robot that may lag behind its set-points: it has ``converged`` once it is at rest,
+   and makes no progress if it rests away from the goal;
 4. the execution monitor, of a plan that gives way to another one: it replans instead of ending the run;
-5. the fault monitor again: nothing ends while it is not known what images mean;
+5. the fault monitor again: no run ends while images are ambiguous;
 6. ``bounded``, over the command of a run that goes on, and the execution monitor over its joint limit.
 
-``failed`` ends a run wherever a robot or a law of somebody else raises once it has begun.
+``failed`` ends a run if a robot or a law of the user raises after its start.
 """
 
 import math
@@ -82,9 +82,9 @@ _compiled_bind, _compiled_command = njit(_bind, allocates=True), njit(_bound_com
 
 
 # Optional attributes of a law and their defaults: the fraction of the amplitude that its own
-# joint-speed limit left, negative where the limit is up to the loop; what fitting a body left, and the image
-# error (px) of the face by which the run is judged; the joint at whose limit it ended a step, or −1; joints
-# (parts + 1, n) between the parts in which it wants a step sent.
+# joint-speed limit left, negative if the limit is up to the loop; residual of the fit of a body, and the
+# image error (px) of the face by which the run is judged; the joint at whose limit it ended a step, or −1;
+# joints (parts + 1, n) between the parts in which it wants a step sent.
 _OPTIONAL: dict[str, tuple[float, ...]] = {
     "share": (-1.0,),
     "fit": (math.nan, math.nan, math.nan),
@@ -99,7 +99,7 @@ class Monitored(Protocol):
 
     plant: Plant  # the truth, or its calibrated model: image size, joint limits
     # why the run cannot go on, the images no longer agree with the calibration or something failed; None
-    # where it can
+    # if it can
     disturbance: Finding | None
 
     @property
@@ -130,7 +130,7 @@ class Monitors(NamedTuple):
     execution: Monitor | None = None
 
     def of_faults(self, k: int) -> int:
-        """Verdict before the law is asked: ``RUNNING`` where it may be."""
+        """Verdict before the law is asked: ``RUNNING`` if it may be."""
         if self.plant.disturbance:
             return FAULT_DETECTED
         if not self.plant.holds:
@@ -165,7 +165,7 @@ class LoopLaw(Protocol):
     def __call__(self, s: FloatArray, q: FloatArray) -> tuple[int, FloatArray]:
         """Status and joint velocity (n,), rad/s or m/s, for pixels (V, m, 2) and joints (n,).
 
-        Pixels are NaN where a marker was not seen; the status is LOST where too little was.
+        Pixels are NaN if a marker was not seen; the status is LOST where too little was.
         """
 
 
@@ -176,10 +176,10 @@ class _LoopPlant(Monitored, Protocol):
     H: FloatArray  # (4, 4) displacement of the face from the reference
     hidden: FloatArray
     in_front: bool  # hidden, in_front: as of ``simulation.analytic_plant.observe``, when last observed
-    markers: int  # how many are observed, those of the face first
+    markers: int  # number that is observed, the face first
     takes_parts: bool  # whether a long step is sent in the parts that the law split it into
     weight: FloatArray | None  # (V, markers) of the pixels last observed in a fit; None for one
-    noise_ratio: float  # of what the pixels last observed state to the noise of the run; at least 1
+    noise_ratio: float  # stated noise of the last pixels over the noise of the run; at least 1
 
     def joints(self) -> FloatArray:
         """Joint readings (n,), rad or m."""
@@ -188,7 +188,7 @@ class _LoopPlant(Monitored, Protocol):
         """Pixels (V, markers, 2), NaN where unseen."""
 
     def distance(self) -> float:
-        """Distance of the face from the rig when last observed, m; constant where it is unknown."""
+        """Distance of the face from the rig when last observed, m; constant if it is unknown."""
 
     def command(self, step: FloatArray, period: float) -> None:
         """Move by the joint step (n,), rad or m, within one period, s."""
@@ -228,7 +228,7 @@ class BuiltInLaw:
 
     @property
     def path(self) -> FloatArray:
-        """Joints (parts + 1, n) between the parts of the last step; one row where it has none."""
+        """Joints (parts + 1, n) between the parts of the last step; one row if it has none."""
         return self.state.path[: self.state.parts[0] + 1] if self.gains.substeps else self.state.path[:1]
 
     def __call__(self, s: FloatArray, q: FloatArray) -> tuple[int, FloatArray]:
@@ -321,7 +321,7 @@ def _instant(
 def _send(
     law: LoopLaw, plant: _LoopPlant, dq: FloatArray, limits: Limits, period: float, scale: float
 ) -> None:
-    """Send a joint step (n,), or the parts that the law split it into where they lead as far.
+    """Send a joint step (n,), or the parts that the law split it into if they lead as far.
 
     Each part takes as long as the joint-speed limit asks of it, and its share of the time that is left. Parts
     in which joints take turns may ask for more than the period.

@@ -43,13 +43,13 @@ class _Replanner(Protocol):
     """Paths to the goal of a task."""
 
     def predicted(self, q: FloatArray) -> FloatArray:
-        """Pixels (V, b, 2) of the body at joints (n,), by the calibration, those of the face first."""
+        """Pixels (V, b, 2) of the body at joints (n,), by the calibration, the face first."""
 
     def leaves(self, q: FloatArray, off: FloatArray) -> bool:
-        """Whether a path of joints (s, n) leaves an image, where images are off by (s, V, 2), px."""
+        """Whether a path of joints (s, n) leaves an image, if images err by (s, V, 2), px."""
 
     def replan(self, q: FloatArray, excluded: FloatArray, off: FloatArray) -> Plan | None:
-        """Plan of a path from joints (n,), off by (V, 2) px, to other goals than those excluded (k, n)."""
+        """Plan of a path from joints (n,), with image errors (V, 2), px, to goals not excluded (k, n)."""
 
 
 def _stopped(verdict: int) -> bool:
@@ -134,7 +134,7 @@ class ExecutionMonitor:
         return verdict
 
     def _replanned(self, log: Log, k: int, verdict: int, why: str) -> int:
-        """Hold the robot and follow another path, if there is one; else keep the verdict."""
+        """Hold the robot and follow another path, if there is one; otherwise keep the verdict."""
         if not self.left:
             return verdict
         self.left -= 1
@@ -184,7 +184,7 @@ class ExecutionMonitor:
         return np.asarray(np.where(visible, off, 0.0).sum(axis=(0, 2)) / count)
 
     def _leaves_image(self, log: Log, k: int, ahead: FloatArray) -> bool:
-        """Whether the face leaves an image along joints (s, n), by what images are off now and there."""
+        """Whether the face leaves an image along joints (s, n), by the image errors now and there."""
         s_star = self.law.law.task.s_star
         at_goal = (s_star - self.replanner.predicted(ahead[-1])[:, : s_star.shape[1]]).mean(axis=1)
         x = np.linspace(0.0, 1.0, len(ahead))[:, None, None]

@@ -24,10 +24,10 @@ class Ended(NamedTuple):
 
 
 class Summary(NamedTuple):
-    """Numbers of a run that ended; NaN where they need the true goal and that is not known."""
+    """Numbers of a run that ended; NaN if they need the true goal and that is not known."""
 
-    # 1 where it converged and, at every instant, enough cameras truly saw the face whole and from its front
-    # and no joint was past a limit, 0 where not; what happens between the instants is not looked at
+    # 1 if it converged and, at every instant, enough cameras truly saw the face whole and from its front
+    # and no joint was past a limit, 0 if not; the time between the instants is not checked
     success: float
     image_error_px: float  # at the end, rms over markers and views
     first_outside_image: int
@@ -40,7 +40,7 @@ class Summary(NamedTuple):
     distance_mm: float
     position_error_mm: float
     rotation_error_deg: float  # position_error_mm, rotation_error_deg: errors at the end
-    path_length_mm: float  # of the centre, from sample to sample
+    path_length_mm: float  # path of the centre, from sample to sample
     center_deviation_at_samples_mm: float  # largest distance of the centre from its line
 
 
@@ -61,7 +61,7 @@ def summarize(plant: Plant, log: Log, ended: Ended, period: float, ends: Ends) -
     base_tool, goal_pose = mat(ends.base_tool), mat(ends.goal_pose)
     pose_first, pose = mul(first, base_tool), mul(last, base_tool)
     error = _distance(end, goal)
-    if plant.model.on_tool:  # the displacement is that of the scene: the error is that of the tool's origin
+    if plant.model.on_tool:  # the scene is displaced: the error is measured at the tool's origin
         pose_first = mul(backward(plant.model, log.q[0]), base_tool)
         pose = mul(backward(plant.model, log.q[steps]), base_tool)
         error = _distance(_origin(pose), _origin(goal_pose))
@@ -181,7 +181,7 @@ def path_deviation(
 
 @merged
 def _line_distance(A: Vec4, start: Vec4, goal: Vec4) -> float:
-    """Distance of a metric point from the line through start and goal; from start where they agree."""
+    """Distance of a metric point from the line through start and goal; from start if they agree."""
     distance = axpy(-1.0, start, goal)
     off = axpy(-1.0, start, A)
     length = dot(distance, distance)

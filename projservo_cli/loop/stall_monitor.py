@@ -1,6 +1,6 @@
 """Settling: whether a robot has arrived, or is stalled away from its goal, judged while it runs.
 
-A robot that may lag behind its set-points has arrived once it stands. Joints that lag or sag, and images
+A robot that may lag behind its set-points has arrived once it is at rest. Joints that lag or sag, and images
 with latency, show their errors at the goal only.
 """
 
@@ -23,18 +23,18 @@ from projservo_cli.loop.verdicts import (
 from projservo_cli.records import BoolArray, FloatArray
 from projservo_cli.robots.latency_compensation import DrivenRobot
 
-# Share of the tolerance that a robot which stands may still move.
+# Share of the tolerance that a robot at rest may still move.
 _SETTLED = 0.5
 # At the goal, which one noisy frame may show too soon, the law goes on for these periods; then the robot is
-# held until it stands. It moves again if the error is beyond these tolerances, or beyond one in these
+# held until it is at rest. It moves again if the error is beyond these tolerances, or beyond one in these
 # consecutive frames.
 _MORE, _GROWN, _LOOKS = 15, 3.0, 5
 # Without progress at an image error of no more than this multiple of the tolerance, steps become shorter.
 _NEAR = 10.0
 # Progress is an image error that falls by this fraction below its minimum so far.
 _FALL = 0.01
-# Joints stand if they move by less than these deviations of their readings, or than this, rad or m; their
-# set-points do by the latter.
+# Joints are at rest if they move by less than these deviations of their readings, or than this, rad or m;
+# their set-points do by the latter.
 _DEVIATIONS, _LEAST = 4.0, 3e-4
 # A joint does not follow if it stays while its set-point moves by this multiple of its sag.
 _STAYS = 2.0
@@ -97,7 +97,7 @@ class StallMonitor:
         return verdict if verdict == CONVERGED else self._stuck(now, verdict, error <= _GROWN * within)
 
     def _arrived(self, verdict: int, error: float, within: float) -> int:
-        """``CONVERGED`` where the robot stands at the goal; until then the law goes on, then waits."""
+        """``CONVERGED`` if the robot is at rest at the goal; until then the law goes on, then waits."""
         if verdict == CONVERGED and not self._looks:
             self._looks, self._more = _LOOKS, _MORE if self._limits.noise_px > 0.0 else 0
         if not self._looks or error > _GROWN * within:
@@ -114,7 +114,7 @@ class StallMonitor:
     def _stuck(self, now: int, verdict: int, near: bool) -> int:
         """Return why the robot makes no progress, or the verdict.
 
-        ``MARKERS_LOST`` where it was held most of the time, since markers flicker.
+        ``MARKERS_LOST`` if it was held most of the time, since markers flicker.
         ``near``: whether it is so near the goal that its joints may not resolve the command.
         """
         idle, window = now - self._since, self._window
@@ -129,9 +129,11 @@ class StallMonitor:
             self.reason = self._staying(stays)
             return FOLLOWING_ERROR
         if stands and (sent <= _LEAST).all():
-            held = self._held[-window:]
-            if np.mean(held) > _MOSTLY:
-                self.reason = Finding("marker_flickers", REFUSES, amount=sum(held), limit=len(held), unit="1")
+            holds = self._held[-window:]
+            if np.mean(holds) > _MOSTLY:
+                self.reason = Finding(
+                    "marker_flickers", REFUSES, amount=sum(holds), limit=len(holds), unit="1"
+                )
                 return MARKERS_LOST
             self.minimum = True
             far = float(sent.max())

@@ -60,7 +60,7 @@ class Rehearsal:
     def better(self, task: Task, state: State) -> tuple[int, Parts, bool]:
         """A partitioned task in the better sense: its verdict, its parts, and whether it arrives."""
         model = self.model
-        # Cameras have no sign of their own; the plant distinguishes front and back by positive depths.
+        # Cameras have no sign; the plant distinguishes front and back by positive depths.
         depth = model.P[:, 2] @ np.array(center_of(state.A, MIDPOINT))
         seen = model._replace(P=model.P * np.sign(depth)[:, None, None])
         M = np.ascontiguousarray(state.A @ as_array(backward(model, self.q_start)).T)
@@ -74,9 +74,9 @@ class Rehearsal:
             image_size=np.full((len(task.O), 2), np.inf),
             limits=self.bounds,
             opaque=False,
-            least_views=task.least_views,
+            min_views=task.min_views,
         )
-        # The face alone is shown, by points where a pair of views shows it.
+        # The face alone is shown, by points if a pair of views shows it.
         body = NO_BODY if len(task.pair) else task.body._replace(weight=np.ones_like(task.body.weight))
         law = make_law(_DIRECT_TWO, seen, task._replace(body=body), _REHEARSAL)
         step = np.full(len(self.q_start), _REHEARSAL_STEP)
@@ -100,7 +100,7 @@ class Rehearsal:
             return verdict != CONVERGED, bool(self.log.events[1] >= 0.0), steps
 
         first = simulated(1.0, _REHEARSAL_STEPS)
-        # Where the first sense does well, the other one is better only if it arrives before.
+        # If the first sense does well, the other one is better only if it arrives before.
         other = simulated(-1.0, _REHEARSAL_STEPS if any(first[:2]) else max(0, first[2] - 1))
         state.driven[1] = (-1.0 if other < first else 1.0) * q_hat_p
         parts = partition(task, make_split(state))
@@ -114,9 +114,9 @@ def begin(
 
     model : calibrated; task : in its frame.
     s : (V, b, 2) straight pixels at the start; q_start : (n,) joints there, rad or m.
-    bounds : limits of the joints, where a half turn is to be made in the sense
+    bounds : limits of the joints, if a half turn is to be made in the sense
         that is better when rehearsed.
-    Returns the state with the face and the joint motions; the parts; False where neither sense of a half turn
+    Returns the state with the face and the joint motions; the parts; False if neither sense of a half turn
     arrived. Raises WorkFailed if the face is not seen, or a motion not unique.
     """
     m, span, arrives = len(task.A_star), make_span(model, task.A_star), True

@@ -2,7 +2,7 @@
 
 Of several verdicts at one instant ``verdict_at`` gives the first of ``behind camera``, ``out of view``,
 ``markers lost``, ``converged``, ``diverged``, ``singular``, ``no progress`` or ``max steps``, and ``joint
-limit``; ``loop.python_loop`` states what rules before and after it. ``messages.verdicts`` has their causes. A
+limit``; ``loop.python_loop`` states the rules before and after it. ``messages.verdicts`` has their causes. A
 command that would pass a limit is shortened to end there.
 
 While markers are lost the robot is held where it is for up to ``max_lost_periods`` periods in a row; the run
@@ -46,7 +46,7 @@ _ROUND_OFF = 1e-12
 
 
 class Limits(NamedTuple):
-    """When a run ends and what bounds its commands."""
+    """End conditions of a run, and bounds of its commands."""
 
     speed: FloatArray  # (n,) most joint motion per second, rad/s or m/s; infinite for none
     image_error_px: float  # image error that counts as converged, px rms per marker and view
@@ -66,16 +66,16 @@ class Log(NamedTuple):
     read: FloatArray  # (k, n) joint readings, the input of the law
     H: FloatArray  # (k, 4, 4) true displacement of the face from the reference
     s: FloatArray  # (k, V, m, 2) measured pixels of the face and, after them, of the pins
-    hidden: FloatArray  # (k, V) 1 where a view is self-occluded
+    hidden: FloatArray  # (k, V) 1 if a view is self-occluded
     error: FloatArray  # (k,) image error of the face as it is seen, px rms per marker and view
-    # (k,) image error by which the run ends: of the body where it is measured, else as seen
+    # (k,) image error by which the run ends: of the body if it is measured, otherwise as seen
     judged: FloatArray
     errors: FloatArray  # (k, 5) control errors of the law
-    q_dot: FloatArray  # (k, n) commanded joint velocities after the limit; zero where none was sent
+    q_dot: FloatArray  # (k, n) commanded joint velocities after the limit; zero if none was sent
     factor: FloatArray  # (k,) factor of the joint-speed limit
     path: FloatArray  # (k, parts + 1, n) joints at the ends of the parts of each step
-    parts: IntArray  # (k,) parts each step was sent in; 0 where the joints went straight to the end
-    fit: FloatArray  # (k, 3) what measuring with the body left, as in the state of the law
+    parts: IntArray  # (k,) parts each step was sent in; 0 if the joints went straight to the end
+    fit: FloatArray  # (k, 3) residuals of measuring with the body, as in the state of the law
     # (3,) first instant outside an image, first beyond a joint limit, and the joint that passed one or
     # stopped the run at its own; −1 for never
     events: FloatArray
@@ -87,7 +87,7 @@ class Log(NamedTuple):
 
 
 def new_log(n: int, m: int, max_steps: int, errors: int, parts: int = 0, views: int = len(VIEWS)) -> Log:
-    """Empty log for n joints, m markers in so many views, at most ``max_steps`` commands of so many parts."""
+    """Empty log for n joints, m markers in V views, at most ``max_steps`` commands of some parts."""
     rows = max_steps + 1
     return Log(
         q=np.zeros((rows, n)),
@@ -112,7 +112,7 @@ def new_log(n: int, m: int, max_steps: int, errors: int, parts: int = 0, views: 
 
 @merged
 def note(log: Log, k: int, s_star: FloatArray, plant: Plant, limits: Limits) -> bool:
-    """Log what images and readings of an instant say by themselves; whether a face marker left an image."""
+    """Log the images and readings of an instant; whether a face marker left an image."""
     left = _outside(log.s[k], s_star.shape[1], plant)
     if left and log.events[0] < 0.0:
         log.events[0] = k
@@ -129,7 +129,7 @@ def note(log: Log, k: int, s_star: FloatArray, plant: Plant, limits: Limits) -> 
 def _image_error(s: FloatArray, s_star: FloatArray) -> float:
     """Root mean square of the Euclidean pixel error over the markers and views of the face seen.
 
-    NaN where none is. Further markers in ``s`` do not count.
+    NaN if none is. Further markers in ``s`` do not count.
     """
     total = 0.0
     count = 0
@@ -154,7 +154,7 @@ def _outside(s: FloatArray, m: int, plant: Plant) -> bool:
             if math.isfinite(u + v) and from_border(plant.image_size[view], u, v) < 0.0:
                 outside = True
         left_out += outside
-    return bool(left_out > s.shape[0] - plant.least_views)
+    return bool(left_out > s.shape[0] - plant.min_views)
 
 
 class Instant(NamedTuple):
@@ -162,10 +162,10 @@ class Instant(NamedTuple):
 
     in_front: bool  # whether enough cameras have every face marker before them; the law is asked only then
     left: bool  # whether a face marker lies outside an image
-    distance: float  # of the face from the rig, m
-    status: int  # of the law
+    distance: float  # distance of the face from the rig, m
+    status: int  # status of the law
     q_dot: FloatArray  # (n,) the command, rad/s or m/s
-    noise_ratio: float = 1.0  # of what pixels state to the noise of the run; at least 1
+    noise_ratio: float = 1.0  # stated noise of pixels over the noise of the run; at least 1
 
 
 @merged
@@ -210,9 +210,9 @@ def _first_cause(log: Log, k: int, now: Instant, limits: Limits) -> int:
 def tolerance(limits: Limits, views: float, noise_ratio: float) -> float:
     """Image error that counts as converged, px rms per marker and view.
 
-    A body fitted by six coordinates to so many markers, counted once a view, keeps √(6 / (2 views)) of
-    the noise of their pixels; all of it stays where the face is measured point by point, for NaN.
-    noise_ratio : of what pixels state to the noise of the run.
+    A body fitted by six coordinates to N markers, counted once per view, keeps √(6 / (2 views)) of
+    the noise of their pixels; all of it stays if the face is measured point by point, for NaN.
+    noise_ratio : stated noise of pixels over the noise of the run.
     """
     fitted = max(0.0, 1.0 - math.sqrt(3.0 / views)) if views > 0.0 else 0.0
     more = (noise_ratio - 1.0) * (1.0 - fitted)
@@ -267,7 +267,7 @@ class Command(NamedTuple):
 def bounded(log: Log, k: int, asked: Command, plant: Plant, limits: Limits) -> int:
     """Bound a command; its joint step (n,), rad or m, goes to the first row of ``log.scratch``.
 
-    Returns ``JOINT_LIMIT`` where no motion is left, else ``RUNNING``.
+    Returns ``JOINT_LIMIT`` if no motion is left, otherwise ``RUNNING``.
     """
     q_dot = asked.q_dot
     dq = log.scratch[0, : q_dot.shape[0]]

@@ -30,7 +30,7 @@ _OF_REASON = ("noise", "residuals", "joint_noise", "deviations", "unshown")
 
 
 def limit(one: Finding, setup: Setup) -> str:
-    """Return what a finding limits predictions by, after "limited by"."""
+    """Return the limit that a finding sets to predictions, after "limited by"."""
     return Wording([one], setup).text("limit")
 
 
@@ -51,9 +51,9 @@ def lines(findings: Iterable[Finding], setup: Setup = _SETUP) -> tuple[str, ...]
 
 
 def table_row(one: Finding, setup: Setup) -> dict[str, str]:
-    """Return a finding as a row of a table: its level, what it is about, what is found, and the remedy."""
-    told = Wording([one], setup)
-    where, remedy = told.text("where") or "robot and cameras", told.text("remedy")
+    """Return a finding as a row of a table: level, subject, message and remedy."""
+    remaining = Wording([one], setup)
+    where, remedy = remaining.text("where") or "robot and cameras", remaining.text("remedy")
     return {"level": _LEVELS[one.severity], "where": where, "text": sentence(one, setup), "remedy": remedy}
 
 
@@ -66,7 +66,7 @@ def failed(
     stage: str = "",
     refutes: bool = False,
 ) -> WorkFailed:
-    """Return the error that findings are, told between a beginning and an end, after the work that failed."""
+    """Return the error of findings, worded between a beginning and an end, after the work that failed."""
     found = tuple(findings)
     return WorkFailed(f"{begin}{text(found, setup)}{end}", stage=stage, refutes=refutes, findings=found)
 
@@ -77,7 +77,7 @@ def text(findings: Iterable[Finding], setup: Setup = _SETUP) -> str:
 
 
 def reason(findings: Sequence[Finding], setup: Setup) -> str:
-    """Return why a calibration is usable or not: its residuals, and what limits it."""
+    """Return why a calibration is usable or not: its residuals and its limits."""
     about, *rest = findings
     text = sentence(about, setup)
     if about.code == "told" and first(rest, REFUSES) is None:
@@ -94,22 +94,22 @@ def reason(findings: Sequence[Finding], setup: Setup) -> str:
 
 
 def advice(findings: Iterable[Finding], setup: Setup) -> tuple[str, ...]:
-    """Return what to do about a calibration, a line each, of deviations from the model the largest."""
-    told = [one for one in findings if one.code not in _OF_REASON]
-    least = [one for one in told if one.code in DEVIATIONS][_MAX_NAMED:]
-    return lines((one for one in told if one not in least), setup)
+    """Return the remedies for a calibration, a line each, with the largest deviations from the model."""
+    remaining = [one for one in findings if one.code not in _OF_REASON]
+    unnamed = [one for one in remaining if one.code in DEVIATIONS][_MAX_NAMED:]
+    return lines((one for one in remaining if one not in unnamed), setup)
 
 
 def refused(findings: Sequence[Finding], setup: Setup) -> str:
     """Return why data make no calibration: a cause that would explain them, the misfit, and a hint."""
-    told, words = list(findings), ""
-    while told and told[0].code in _CAUSES and len(told) > 1:
-        words += f"{sentence_and_remedy(told.pop(0), setup)}; as given, "
-    main, *hints = told
+    remaining, words = list(findings), ""
+    while remaining and remaining[0].code in _CAUSES and len(remaining) > 1:
+        words += f"{sentence_and_remedy(remaining.pop(0), setup)}; as given, "
+    main, *hints = remaining
     words += sentence(main, setup) if hints and main.code == "misfit" else sentence_and_remedy(main, setup)
     for hint in hints:
-        look = f"the residuals look as if {sentence(hint, setup)}"
-        words += f"; {look if hint.code in DEVIATIONS else sentence_and_remedy(hint, setup)}"
+        hint_text = f"the residuals look as if {sentence(hint, setup)}"
+        words += f"; {hint_text if hint.code in DEVIATIONS else sentence_and_remedy(hint, setup)}"
     return words
 
 
@@ -150,7 +150,7 @@ def setup_of(calibration: Calibration) -> Setup:
 
 
 def _cause(findings: Sequence[Finding]) -> Finding:
-    """Return the finding that limits predictions most: one that refuses, else the first that limits."""
+    """Return the finding that limits predictions most: one that refuses, otherwise the first that limits."""
     about, *rest = findings
     limiting = [one for one in rest if ROWS[one.code].limit]
     return first(limiting, REFUSES) or first(limiting, LIMITS) or about

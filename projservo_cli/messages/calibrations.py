@@ -1,4 +1,4 @@
-"""Words for what is off in a calibration, its data and its fit."""
+"""Words for errors in a calibration, its data and its fit."""
 
 from projservo_cli.messages.row_form import Row
 
@@ -175,7 +175,7 @@ CALIBRATION = {
         "the board looks the same turned by {amount}: {of_images}, and were turned right",
         "a ChArUco board, or one with an odd and an even side, needs no turn",
     ),
-    "told": Row("{name}"),  # by an earlier version, which stored sentences alone
+    "told": Row("{name}"),  # an earlier version stored sentences alone
     "whole_seconds": Row(
         "{name} of poses in motion are whole seconds, so no latency of the images was estimated",
         "record their fractions",
@@ -292,7 +292,7 @@ CALIBRATION = {
         limit="joint readings",
     ),
 }
-# A fit that does not pass, and what would explain it.
+# A fit that does not pass, and possible explanations.
 _READINGS = "check the joint readings and types (R or P)"
 _MISFIT = "the fit does not describe the data: "
 _NO_FIT = _MISFIT + "{percent} % of the detections do not fit it, and "
@@ -364,7 +364,7 @@ REFUSALS = {
         limit="the order of joints",
     ),
 }
-# With cameras on the tool the chain ends at them, and the markers are in the scene.
+# If cameras are on the tool, the chain ends at them, and the markers are in the scene.
 ON_THE_TOOL = {
     "base": Row(
         "the cameras moved on the tool{begin}, by {size}", _AGAIN, limit="motion of the cameras on the tool"

@@ -1,4 +1,4 @@
-"""Words for what has changed since a calibration, by images of a robot at work."""
+"""Words for changes since a calibration, by images of a robot at work."""
 
 from projservo_cli.messages.row_form import Row
 
@@ -53,7 +53,7 @@ FAULTS = {
         "{numbered} moved {place}, by {amount}{covered}", "put back what moved, or recalibrate"
     ),
 }
-# One camera does not tell its own motion from one of the base.
+# One camera cannot separate its own motion from a motion of the base.
 BY_ONE = {"displaced_camera": Row("{cameras} was moved, or the base was, by {amount}", _PUT_BACK)}
 ON_THE_TOOL = {
     "displaced_camera": Row("{cameras} slipped on the tool, by {amount}", _PUT_BACK),

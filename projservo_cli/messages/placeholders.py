@@ -10,7 +10,7 @@ from projservo_cli.messages.rows_by_code import Setup, row_of
 from projservo_cli.messages.verdicts import because
 from projservo_cli.records import CORNERS, LIMITS_MISSING, TOOL
 
-# Digits of what is compared with a limit, which may be close.
+# Digits of a value that is compared with a limit, which may be close.
 _DIGITS = 6
 # Maximum number of names in a list of examples, and of runs of poses.
 _EXAMPLES, _MAX_RUNS = 3, 4
@@ -50,7 +50,7 @@ _FREEDOMS = {
 
 
 class Wording:
-    """Findings that one line tells, the first for all; values are looked up as in a dictionary."""
+    """Findings that share one line, the first for all; values are looked up as in a dictionary."""
 
     def __init__(self, alike: Sequence[Finding], setup: Setup) -> None:
         self.alike, self.setup, self.one = alike, setup, alike[0]
@@ -90,7 +90,7 @@ class Wording:
 
     @property
     def rest(self) -> Finding:
-        """What the first consists of, else itself."""
+        """First part of the finding, or the finding itself."""
         return self.one.others[0] if self.one.others else self.one
 
 
@@ -102,8 +102,8 @@ def quantity(value: float, unit: str, digits: int = 3) -> str:
 
 def joined(words: Iterable[object]) -> str:
     """Join words by commas, the last by "and"."""
-    told = [*map(str, words)]
-    return " and ".join(filter(None, (", ".join(told[:-1]), *told[-1:])))
+    line = [*map(str, words)]
+    return " and ".join(filter(None, (", ".join(line[:-1]), *line[-1:])))
 
 
 def _joints(told: Wording) -> str:
@@ -115,16 +115,16 @@ def _joints(told: Wording) -> str:
     return "all joints" if everything else numbered("joint", told.joints)
 
 
-def _leads(told: Wording) -> str:
-    """Say what a start leads to that was not used."""
-    if math.isnan(told.one.amount):
-        cameras = "both cameras" if len(told.setup.view) == 2 else told["all_cameras"]
+def _leads(line: Wording) -> str:
+    """Say why a start was not used."""
+    if math.isnan(line.one.amount):
+        cameras = "both cameras" if len(line.setup.view) == 2 else line["all_cameras"]
         return f"does not put the markers in front of {cameras}"
-    return f"leads to residuals of {told['amount']} instead of {told['limit']}"
+    return f"leads to residuals of {line['amount']} instead of {line['limit']}"
 
 
 def _stands(alike: Sequence[Finding]) -> str:
-    """Say in how many rows numbers stand that no camera saw, the most frequent first."""
+    """Say how many rows have numbers that no camera saw, by decreasing frequency."""
     several = "several markers and poses", "several poses of one marker"
     each = [
         f"{one.subject.name} stands in {one.amount:.0f} rows of {several[len(one.subject.markers) == 1]}"
@@ -192,41 +192,41 @@ def _shared(others: Sequence[Finding]) -> str:
     return ""
 
 
-def _cameras(told: Wording) -> str:
+def _cameras(line: Wording) -> str:
     """Name the cameras of some of the views."""
-    views, names = told.subject.views, told.setup.view
-    if 1 < len(views) == len(names) and told.one.code != "exchanged_cameras":
+    views, names = line.subject.views, line.setup.view
+    if 1 < len(views) == len(names) and line.one.code != "exchanged_cameras":
         return "both cameras" if len(views) == 2 else "all cameras"
-    if told.one.code == "exchanged_cameras":
+    if line.one.code == "exchanged_cameras":
         return f"{joined(f'the {view}' for view in views)} camera"
     return f"the {joined(views)} camera{'s' * (len(views) > 1)}"
 
 
-def _alike(told: Wording) -> str:
-    """Say what looks like a joint that slipped: motions of what it ends at, and a link that flexes."""
+def _alike(line: Wording) -> str:
+    """Name causes that look like a slipped joint: motions at both ends, and a link that flexes."""
     first, last = (
         ("the base or the scene turned likewise", "what holds the cameras turned likewise on the tool")
-        if told.setup.mount == TOOL
+        if line.setup.mount == TOOL
         else ("the base turned likewise", "the tool turned likewise in its holder")
     )
-    ends = [first] * (told.joints == [1]) + [last] * (told.joints == [told.setup.joints])
-    return "".join(f" or {what}" for what in ends + ["its link flexes"] * bool(told.one.others))
+    ends = [first] * (line.joints == [1]) + [last] * (line.joints == [line.setup.joints])
+    return "".join(f" or {what}" for what in ends + ["its link flexes"] * bool(line.one.others))
 
 
-def _left(told: Wording) -> str:
-    """Say what is left of the translation, a share, and of the rotation, beside the error."""
+def _left(line: Wording) -> str:
+    """State the remaining translation, a share, and rotation, with the error."""
     each = [
         f"{quantity(one.amount, one.unit)} of rotation"
         if one.unit == "rad"
         else f"{one.amount:.1%} of the translation"
-        for one in told.one.others
+        for one in line.one.others
     ]
     return "".join(f"{text} and " for text in each)
 
 
-def _dark(told: Wording) -> str:
+def _dark(line: Wording) -> str:
     """Say which cameras show no marker."""
-    dark, views = told.subject.views, told.setup.view
+    dark, views = line.subject.views, line.setup.view
     if len(dark) == 1:
         return f"the {dark[0]} camera shows no marker"
     if len(dark) == len(views):
@@ -234,9 +234,9 @@ def _dark(told: Wording) -> str:
     return f"none of the cameras {', '.join(dark)} shows a marker"
 
 
-def _enough_see(told: Wording) -> str:
+def _enough_see(line: Wording) -> str:
     """Say how many cameras see the face that are to; ``limit`` is their number."""
-    least, cameras = told.one.limit, len(told.setup.view)
+    least, cameras = line.one.limit, len(line.setup.view)
     if least < cameras:
         return f"{least:.0f} of {cameras} cameras see"
     return {1: "the camera sees", 2: "both cameras see"}.get(cameras, f"all {cameras} cameras see")
@@ -249,19 +249,19 @@ def _fixed(one: Finding, sign: str = "") -> str:
     return f"{amount:{sign}.{digits}f}{unit} ± {factor * one.deviation:.{digits}f}{unit}"
 
 
-def _shifted(told: Wording) -> str:
+def _shifted(line: Wording) -> str:
     """Say how an image is shifted against the other, or the others."""
-    if not told.one.others:
+    if not line.one.others:
         return ""
-    by = ", ".join(f"{one.amount:.2g}" for one in told.one.others)
-    others = f"{told.setup.view[-1]} one" if len(told.setup.view) == 2 else "others"
-    return f", as if the {told['view']} image were shifted by ({by}) px against the {others}"
+    by = ", ".join(f"{one.amount:.2g}" for one in line.one.others)
+    others = f"{line.setup.view[-1]} one" if len(line.setup.view) == 2 else "others"
+    return f", as if the {line['view']} image were shifted by ({by}) px against the {others}"
 
 
-def _about_line(told: Wording) -> str:
+def _about_line(line: Wording) -> str:
     """Say about which line of markers an object may be turned."""
     return "".join(
-        f" about the line of {numbered('marker', one.subject.markers)}" for one in told.one.others[:1]
+        f" about the line of {numbered('marker', one.subject.markers)}" for one in line.one.others[:1]
     )
 
 
@@ -276,21 +276,21 @@ def all_of(views: Sequence[str]) -> str:
 
 
 def sharing(views: Sequence[str]) -> str:
-    """Begin a message on what two cameras see together, or one by itself."""
+    """Begin a message on a view of two cameras together, or of one alone."""
     return {1: f"the {views[0]} camera sees", 2: "both cameras see"}.get(len(views), "two cameras see")
 
 
-def _looked(told: Wording) -> str:
-    """Say where a recording looked: in the poses of a joint, or where the robot stands."""
-    poses = len(told.subject.poses)
+def _looked(line: Wording) -> str:
+    """Say where a recording looked: in the poses of a joint, or where the robot is."""
+    poses = len(line.subject.poses)
     return (
-        f" in the {poses} poses of {numbered('joint', told.joints)}" if poses else " where the robot stands"
+        f" in the {poses} poses of {numbered('joint', line.joints)}" if poses else " where the robot stands"
     )
 
 
-def _by_views(told: Wording, one: str, two: str, more: str) -> str:
+def _by_views(line: Wording, one: str, two: str, more: str) -> str:
     """Choose words by the number of the cameras."""
-    return {1: one, 2: two}.get(len(told.setup.view), more)
+    return {1: one, 2: two}.get(len(line.setup.view), more)
 
 
 def _play(one: Finding) -> str:
@@ -300,39 +300,39 @@ def _play(one: Finding) -> str:
     return f"{one.subject.name} {size}"
 
 
-def _within(told: Wording) -> str:
-    """Say how far images and joints agree on the tool, where its size is known."""
-    if math.isnan(told.one.amount):
+def _within(line: Wording) -> str:
+    """Say how far images and joints agree on the tool, if its size is known."""
+    if math.isnan(line.one.amount):
         return ""
-    return f", which show the tool within {quantity(told.one.amount, 'm', 2)} of where its joints put it"
+    return f", which show the tool within {quantity(line.one.amount, 'm', 2)} of where its joints put it"
 
 
-def _model_errors(told: Wording) -> str:
-    """Join what is off in a model, and what else it may be."""
-    *words, last = told.others("sentence")
-    undecided = told.one.others[-1].code == "undecided_model"
+def _model_errors(line: Wording) -> str:
+    """Join the errors in a model, and their alternatives."""
+    *words, last = line.others("sentence")
+    undecided = line.one.others[-1].code == "undecided_model"
     return f"{' and '.join(words)} {last}" if undecided else " and ".join((*words, last))
 
 
 VALUES: dict[str, Callable[[Wording], object]] = {
-    # Of the subject.
-    "of": lambda told: told.subject.joints,
-    "name": lambda told: told.subject.name,
+    # Values of the subject.
+    "of": lambda line: line.subject.joints,
+    "name": lambda line: line.subject.name,
     "joints": _joints,
-    "one_of": lambda told: told["joints"] if told.single else f"one of {told['joints']}",
-    "it": lambda told: "it" if told.single else "each",
-    "moves": lambda told: "moves" if told.single else "move",
-    "reads": lambda told: "it reads" if told.single else "they read",
-    "all_cameras": lambda told: "the camera" if len(told.setup.view) == 1 else "all cameras",
-    "view": lambda told: told.subject.views[0] if told.subject.views else "",
-    "other_view": lambda told: told.subject.views[-1] if told.subject.views else "",
-    "in_view": lambda told: f" in the {told.subject.views[0]} view" if told.subject.views else "",
-    "markers": lambda told: "the markers" if told.subject.tag is None else f"tag {told.subject.tag}",
-    "numbers": lambda told: examples(told.subject.markers),
-    "begin": lambda told: f" at pose {told.subject.poses[0]}" if told.subject.poses else "",
-    "poses": lambda told: examples(told.subject.poses),
-    "shown_poses": lambda told: (
-        f"pose {examples(told.rest.subject.poses)}" if told.rest.subject.poses else "another pose"
+    "one_of": lambda line: line["joints"] if line.single else f"one of {line['joints']}",
+    "it": lambda line: "it" if line.single else "each",
+    "moves": lambda line: "moves" if line.single else "move",
+    "reads": lambda line: "it reads" if line.single else "they read",
+    "all_cameras": lambda line: "the camera" if len(line.setup.view) == 1 else "all cameras",
+    "view": lambda line: line.subject.views[0] if line.subject.views else "",
+    "other_view": lambda line: line.subject.views[-1] if line.subject.views else "",
+    "in_view": lambda line: f" in the {line.subject.views[0]} view" if line.subject.views else "",
+    "markers": lambda line: "the markers" if line.subject.tag is None else f"tag {line.subject.tag}",
+    "numbers": lambda line: examples(line.subject.markers),
+    "begin": lambda line: f" at pose {line.subject.poses[0]}" if line.subject.poses else "",
+    "poses": lambda line: examples(line.subject.poses),
+    "shown_poses": lambda line: (
+        f"pose {examples(line.rest.subject.poses)}" if line.rest.subject.poses else "another pose"
     ),
     "runs": lambda told: _runs(told.subject.poses),
     "s": lambda told: "s" if len(set(told.subject.poses)) > 1 else "",
@@ -354,161 +354,161 @@ VALUES: dict[str, Callable[[Wording], object]] = {
     "chi2": lambda told: _band(told.one.others),
     "check_noise": lambda told: "check joint_noise_deg" if len(told.one.others) > 2 else "",
     "leads": _leads,
-    "ticks": lambda told: " (ticks that were counted)" if told.subject.name == "ticks" else "",
-    # Of counts.
-    "count": lambda told: f"{told.one.amount:.0f}",
-    "total": lambda told: f"{told.one.limit:.0f}",
-    "observations": lambda told: "observations were" if told.many else "observation was",
-    "outliers": lambda told: "outliers" if told.many else "an outlier",
-    "disagree": lambda told: "readings disagree" if told.many else "reading disagrees",
-    "times": lambda told: f"{told.one.amount:.0f} times" if told.many else "once",
-    "stands": lambda told: _stands(told.alike),
-    "shared": lambda told: _shared(told.one.others),
-    "of_images": lambda told: _of_images(told.one.others),
-    # Of what it consists of.
-    "unshown": lambda told: ", ".join(told.others("sentence")),
-    "rest": lambda told: f"{told.rest.amount:.0f}",
-    "of_rest": lambda told: f"{told.rest.limit:.0f}",
-    "part": lambda told: quantity(told.rest.amount, told.rest.unit),
-    "of_part": lambda told: quantity(told.rest.limit, told.rest.unit),
-    "of_rest_s": lambda told: quantity(told.rest.limit, "s"),
-    "exact": lambda told: quantity(told.one.amount, told.one.unit, _DIGITS),
-    "exact_limit": lambda told: quantity(told.one.limit, told.one.unit, _DIGITS),
-    "obstructions": lambda told: "; ".join(told.others("sentence")[1:]),
-    "between": lambda told: " to ".join(
-        quantity(end, told.rest.unit, _DIGITS) for end in (told.rest.amount, told.rest.limit)
+    "ticks": lambda line: " (ticks that were counted)" if line.subject.name == "ticks" else "",
+    # Counts.
+    "count": lambda line: f"{line.one.amount:.0f}",
+    "total": lambda line: f"{line.one.limit:.0f}",
+    "observations": lambda line: "observations were" if line.many else "observation was",
+    "outliers": lambda line: "outliers" if line.many else "an outlier",
+    "disagree": lambda line: "readings disagree" if line.many else "reading disagrees",
+    "times": lambda line: f"{line.one.amount:.0f} times" if line.many else "once",
+    "stands": lambda line: _stands(line.alike),
+    "shared": lambda line: _shared(line.one.others),
+    "of_images": lambda line: _of_images(line.one.others),
+    # Parts of the finding.
+    "unshown": lambda line: ", ".join(line.others("sentence")),
+    "rest": lambda line: f"{line.rest.amount:.0f}",
+    "of_rest": lambda line: f"{line.rest.limit:.0f}",
+    "part": lambda line: quantity(line.rest.amount, line.rest.unit),
+    "of_part": lambda line: quantity(line.rest.limit, line.rest.unit),
+    "of_rest_s": lambda line: quantity(line.rest.limit, "s"),
+    "exact": lambda line: quantity(line.one.amount, line.one.unit, _DIGITS),
+    "exact_limit": lambda line: quantity(line.one.limit, line.one.unit, _DIGITS),
+    "obstructions": lambda line: "; ".join(line.others("sentence")[1:]),
+    "between": lambda line: " to ".join(
+        quantity(end, line.rest.unit, _DIGITS) for end in (line.rest.amount, line.rest.limit)
     ),
-    # Of plans.
-    "nearest": lambda told: "all constraints hold; nearest is " if told.one.severity == NOTE else "",
-    "fails": lambda told: "" if told.one.severity == NOTE else " fails first",
-    "at": lambda told: (
+    # Plans.
+    "nearest": lambda line: "all constraints hold; nearest is " if line.one.severity == NOTE else "",
+    "fails": lambda line: "" if line.one.severity == NOTE else " fails first",
+    "at": lambda line: (
         "at "
-        + ", ".join(f"{one.subject.name} {one.amount:.2f}" for one in told.one.others if one.code == "share")
+        + ", ".join(f"{one.subject.name} {one.amount:.2f}" for one in line.one.others if one.code == "share")
     ),
     "enough_see": _enough_see,
-    "enough": lambda told: _by_views(told, "enough cameras", "both cameras", "enough cameras"),
-    "both": lambda told: "both" if len(told.setup.view) == 2 else "all",
-    "since": lambda told: ", ".join(
-        f"{one.subject.views[0]} from path parameter {one.amount:.2f}" for one in told.one.others
+    "enough": lambda line: _by_views(line, "enough cameras", "both cameras", "enough cameras"),
+    "both": lambda line: "both" if len(line.setup.view) == 2 else "all",
+    "since": lambda line: ", ".join(
+        f"{one.subject.views[0]} from path parameter {one.amount:.2f}" for one in line.one.others
     ),
-    "stops": lambda told: ", ".join(told.others("limit")),
-    "speed_limit": lambda told: {"m": "prismatic_speed_limit_m_s"}.get(
-        told.one.unit, "joint_speed_limit_deg_s"
+    "stops": lambda line: ", ".join(line.others("limit")),
+    "speed_limit": lambda line: {"m": "prismatic_speed_limit_m_s"}.get(
+        line.one.unit, "joint_speed_limit_deg_s"
     ),
     "set_limits": lambda _: LIMITS_MISSING,
-    "of_percent": lambda told: f"{100.0 * told.one.limit:g}",
-    "sizes": lambda told: joined(
-        f"{one.amount:.0f}x{one.limit:.0f} {one.subject.views[0]}" for one in told.one.others
+    "of_percent": lambda line: f"{100.0 * line.one.limit:g}",
+    "sizes": lambda line: joined(
+        f"{one.amount:.0f}x{one.limit:.0f} {one.subject.views[0]}" for one in line.one.others
     ),
-    "which": lambda told: f"marker{'s' * (len(told.subject.markers) > 1)} {told['all_numbers'] or 'none'}",
-    "needed": lambda told: _NEEDED.get(told.one.limit, ""),
-    "freedom": lambda told: _FREEDOMS.get(told.one.amount, ""),
+    "which": lambda line: f"marker{'s' * (len(line.subject.markers) > 1)} {line['all_numbers'] or 'none'}",
+    "needed": lambda line: _NEEDED.get(line.one.limit, ""),
+    "freedom": lambda line: _FREEDOMS.get(line.one.amount, ""),
     "about": _about_line,
-    "signed": lambda told: _fixed(told.one, "+").replace("-", "\N{MINUS SIGN}"),
-    "fixed": lambda told: _fixed(told.one),
-    "amount_m": lambda told: f"{told.one.amount:.4g}",
-    "deviation_m": lambda told: f"{told.one.deviation:.1g}",
-    "full": lambda told: f"{100.0 * told.one.amount:+.0f} %".replace("-", "\N{MINUS SIGN}"),
-    "times_as": lambda told: "half" if told.one.amount == 0.5 else f"{told.one.amount:.3g} times",
-    "stand": lambda told: "stands" if len(told.subject.markers) == 1 else "stand",
-    "do": lambda told: "does" if told.single else "do",
-    "period": lambda told: quantity(told.one.period, told.one.unit),
-    "number_of_last": lambda told: f"{told.one.others[-1].amount:g}",
-    "postures": lambda told: (
-        f"postures of joints {told.joints[0]} to {told.joints[-1]}" if told.joints else "poses"
+    "signed": lambda line: _fixed(line.one, "+").replace("-", "\N{MINUS SIGN}"),
+    "fixed": lambda line: _fixed(line.one),
+    "amount_m": lambda line: f"{line.one.amount:.4g}",
+    "deviation_m": lambda line: f"{line.one.deviation:.1g}",
+    "full": lambda line: f"{100.0 * line.one.amount:+.0f} %".replace("-", "\N{MINUS SIGN}"),
+    "times_as": lambda line: "half" if line.one.amount == 0.5 else f"{line.one.amount:.3g} times",
+    "stand": lambda line: "stands" if len(line.subject.markers) == 1 else "stand",
+    "do": lambda line: "does" if line.single else "do",
+    "period": lambda line: quantity(line.one.period, line.one.unit),
+    "number_of_last": lambda line: f"{line.one.others[-1].amount:g}",
+    "postures": lambda line: (
+        f"postures of joints {line.joints[0]} to {line.joints[-1]}" if line.joints else "poses"
     ),
-    "count_others": lambda told: len(told.one.others) - 1,
-    "there_read": lambda told: ", ".join(quantity(one.amount, one.unit, 4) for one in told.one.others[1:]),
+    "count_others": lambda line: len(line.one.others) - 1,
+    "there_read": lambda line: ", ".join(quantity(one.amount, one.unit, 4) for one in line.one.others[1:]),
     "shifted": _shifted,
-    "key": lambda told: {"m": "max_displacement_m"}.get(told.one.unit, "max_rotation_deg"),
-    # Of faults, and of reasons of runs.
-    "causes": lambda told: "; or ".join(
+    "key": lambda line: {"m": "max_displacement_m"}.get(line.one.unit, "max_rotation_deg"),
+    # Faults, and reasons of runs.
+    "causes": lambda line: "; or ".join(
         "; ".join(filter(None, parts))
-        for parts in zip(told.others("sentence"), told.others("remedy"), strict=True)
+        for parts in zip(line.others("sentence"), line.others("remedy"), strict=True)
     ),
-    "each": lambda told: joined(told.others("sentence")),
-    "place": lambda told: "in the scene" if told.setup.mount == TOOL else "on the tool",
-    "tag": lambda told: told.subject.tag,
-    "all_numbers": lambda told: ", ".join(map(str, told.subject.markers)),
-    "numbered": lambda told: numbered("marker", told.subject.markers),
-    "ends": lambda told: f"{told.subject.markers[0]} to {told.subject.markers[-1]}",
-    "covered": lambda told: ", or is covered in part" if len(told.setup.view) == 1 else "",
+    "each": lambda line: joined(line.others("sentence")),
+    "place": lambda line: "in the scene" if line.setup.mount == TOOL else "on the tool",
+    "tag": lambda line: line.subject.tag,
+    "all_numbers": lambda line: ", ".join(map(str, line.subject.markers)),
+    "numbered": lambda line: numbered("marker", line.subject.markers),
+    "ends": lambda line: f"{line.subject.markers[0]} to {line.subject.markers[-1]}",
+    "covered": lambda line: ", or is covered in part" if len(line.setup.view) == 1 else "",
     "cameras": _cameras,
-    "were": lambda told: "was" if len(told.subject.views) == 1 else "were",
-    "them": lambda told: "it" if len(told.subject.views) == 1 else "them",
+    "were": lambda line: "was" if len(line.subject.views) == 1 else "were",
+    "them": lambda line: "it" if len(line.subject.views) == 1 else "them",
     "alike": _alike,
-    "ms": lambda told: " and ".join(f"{1e3 * one.amount:+.3g}" for one in told.one.others),
-    "larger": lambda told: "larger" if told.one.amount > 0.0 else "smaller",
-    "for_long": lambda told: (
-        f", {told.one.amount:.0f} periods after the last that was" if told.one.amount else ""
+    "ms": lambda line: " and ".join(f"{1e3 * one.amount:+.3g}" for one in line.one.others),
+    "larger": lambda line: "larger" if line.one.amount > 0.0 else "smaller",
+    "for_long": lambda line: (
+        f", {line.one.amount:.0f} periods after the last that was" if line.one.amount else ""
     ),
     "left": _left,
-    "because": lambda told: because(told.subject.name),
+    "because": lambda line: because(line.subject.name),
     "dark": _dark,
-    # Of robots and cameras.
-    "tags": lambda told: numbered("tag", sorted({number // CORNERS for number in told.subject.markers})),
-    "are": lambda told: "are" if len({number // CORNERS for number in told.subject.markers}) > 1 else "is",
-    "rate": lambda told: "fewer than 3" if math.isnan(told.one.amount) else f"{told.one.amount:.1f}",
-    "stamped": lambda told: told.subject.name or "when they arrive",
-    "frame_ms": lambda told: f"{1e3 / told.one.limit:.0f}",
-    "in_ms": lambda told: f"{1e3 * told.one.amount:.0f}",
-    "of_name": lambda told: told.rest.subject.name,
-    "sent": lambda told: (
-        f"{told['joints']} was sent to {told['exact_limit']} and stands at "
-        f"{quantity(told.rest.amount, told.rest.unit, _DIGITS)}, {told['amount']} short"
+    # Robots and cameras.
+    "tags": lambda line: numbered("tag", sorted({number // CORNERS for number in line.subject.markers})),
+    "are": lambda line: "are" if len({number // CORNERS for number in line.subject.markers}) > 1 else "is",
+    "rate": lambda line: "fewer than 3" if math.isnan(line.one.amount) else f"{line.one.amount:.1f}",
+    "stamped": lambda line: line.subject.name or "when they arrive",
+    "frame_ms": lambda line: f"{1e3 / line.one.limit:.0f}",
+    "in_ms": lambda line: f"{1e3 * line.one.amount:.0f}",
+    "of_name": lambda line: line.rest.subject.name,
+    "sent": lambda line: (
+        f"{line['joints']} was sent to {line['exact_limit']} and stands at "
+        f"{quantity(line.rest.amount, line.rest.unit, _DIGITS)}, {line['amount']} short"
     ),
-    "instead": lambda told: "" if math.isnan(told.one.amount) else f", it has {told.one.amount:.3g}",
-    "devices": lambda told: (
-        ", ".join(one.subject.name for one in told.one.others) or "none: look at the cable"
+    "instead": lambda line: "" if math.isnan(line.one.amount) else f", it has {line.one.amount:.3g}",
+    "devices": lambda line: (
+        ", ".join(one.subject.name for one in line.one.others) or "none: look at the cable"
     ),
-    "other_device": lambda told: told.rest.subject.name if told.one.others else "another device",
-    "each_frame": lambda told: "each of its frames " if told.subject.views else "",
-    "any_image": lambda told: "it" if math.isnan(told.one.amount) else f"any of {told['count']} images",
-    "as_board": lambda told: told.one.others[-1].subject.name,
-    "two": lambda told: "both" if len(told.setup.view) == 2 else "two",
-    "white": lambda told: f"{told.rest.amount:.1%}",
-    "blur": lambda told: "".join(f", edges blurred by {one.amount:.1f} px" for one in told.one.others[1:]),
-    "widths": lambda told: ", ".join(f"{one.subject.tag} ({one.amount:.0f} px)" for one in told.one.others),
-    "corners": lambda told: "" if math.isnan(told.one.amount) else f"; corners to {told.one.amount:.2g} px",
-    "share": lambda told: _by_views(told, "shows", "share", "two or more show"),
-    "lack": lambda told: _by_views(told, "does not show", "do not both show", "fewer than two show"),
-    "the_images": lambda told: (
-        f"the {told.subject.views[0]} image"
-        if len(told.subject.views) == 1
-        else f"the images of {joined(told.subject.views)}"
+    "other_device": lambda line: line.rest.subject.name if line.one.others else "another device",
+    "each_frame": lambda line: "each of its frames " if line.subject.views else "",
+    "any_image": lambda line: "it" if math.isnan(line.one.amount) else f"any of {line['count']} images",
+    "as_board": lambda line: line.one.others[-1].subject.name,
+    "two": lambda line: "both" if len(line.setup.view) == 2 else "two",
+    "white": lambda line: f"{line.rest.amount:.1%}",
+    "blur": lambda line: "".join(f", edges blurred by {one.amount:.1f} px" for one in line.one.others[1:]),
+    "widths": lambda line: ", ".join(f"{one.subject.tag} ({one.amount:.0f} px)" for one in line.one.others),
+    "corners": lambda line: "" if math.isnan(line.one.amount) else f"; corners to {line.one.amount:.2g} px",
+    "share": lambda line: _by_views(line, "shows", "share", "two or more show"),
+    "lack": lambda line: _by_views(line, "does not show", "do not both show", "fewer than two show"),
+    "the_images": lambda line: (
+        f"the {line.subject.views[0]} image"
+        if len(line.subject.views) == 1
+        else f"the images of {joined(line.subject.views)}"
     ),
-    "images": lambda told: _by_views(told, "image", "both images", "images"),
-    "towards": lambda told: all_of(told.setup.view),
-    "sharing": lambda told: sharing(told.setup.view),
+    "images": lambda line: _by_views(line, "image", "both images", "images"),
+    "towards": lambda line: all_of(line.setup.view),
+    "sharing": lambda line: sharing(line.setup.view),
     "looked": _looked,
-    "half": lambda told: ", half of them or more" if told.subject.poses else "",
-    "seen": lambda told: "".join(f"; {one.subject.views[0]} {one.amount:.0f}" for one in told.one.others[1:]),
-    "counts": lambda told: "|".join(f"{one.amount:.0f}" for one in told.one.others),
-    "no": lambda told: "neither" if len(told.setup.view) == 2 else "no",
-    "here": lambda told: f", which is {told.subject.name} here" if told.subject.name else "",
-    "some": lambda told: examples(told.subject.markers) or "none",
-    "readings": lambda told: ", ".join(quantity(one.amount, one.unit, 4) for one in told.one.others),
-    "amounts": lambda told: ", ".join(map(_play, told.one.others)),
-    "servo": lambda told: servo_name(told.subject),
-    "servos": lambda told: joined(servo_name(one.subject) for one in told.one.others),
-    "after": lambda told: f", after {told['part']}" if told.one.others else "",
-    "carried": lambda told: "cameras" if told.setup.mount == TOOL else "tags",
-    "of_poses": lambda told: len(told.subject.poses),
+    "half": lambda line: ", half of them or more" if line.subject.poses else "",
+    "seen": lambda line: "".join(f"; {one.subject.views[0]} {one.amount:.0f}" for one in line.one.others[1:]),
+    "counts": lambda line: "|".join(f"{one.amount:.0f}" for one in line.one.others),
+    "no": lambda line: "neither" if len(line.setup.view) == 2 else "no",
+    "here": lambda line: f", which is {line.subject.name} here" if line.subject.name else "",
+    "some": lambda line: examples(line.subject.markers) or "none",
+    "readings": lambda line: ", ".join(quantity(one.amount, one.unit, 4) for one in line.one.others),
+    "amounts": lambda line: ", ".join(map(_play, line.one.others)),
+    "servo": lambda line: servo_name(line.subject),
+    "servos": lambda line: joined(servo_name(one.subject) for one in line.one.others),
+    "after": lambda line: f", after {line['part']}" if line.one.others else "",
+    "carried": lambda line: "cameras" if line.setup.mount == TOOL else "tags",
+    "of_poses": lambda line: len(line.subject.poses),
     "within": _within,
-    "found": lambda told: "; ".join(told.others("sentence")),
-    "views_off": lambda told: "".join(f"; {said}" for said in told.others("sentence")),
-    # Of two views that number differently, and of a model.
-    "part_of_cameras": lambda told: {1: "one camera alone"}.get(len(told.subject.views), "some cameras"),
-    "of_all": lambda told: f"median {told['amount']}, " if told.rest.code == "median_limit" else "",
-    "of_markers": lambda told: told.subject.markers,
-    "pairs": lambda told: "; ".join(told.others("sentence")[:_EXAMPLES]),
-    "begins": lambda told: (
-        f": its corners begin {told.one.amount:.0f} further in the right view" if told.one.amount else ""
+    "found": lambda line: "; ".join(line.others("sentence")),
+    "views_off": lambda line: "".join(f"; {said}" for said in line.others("sentence")),
+    # Two views that number differently, and a model.
+    "part_of_cameras": lambda line: {1: "one camera alone"}.get(len(line.subject.views), "some cameras"),
+    "of_all": lambda line: f"median {line['amount']}, " if line.rest.code == "median_limit" else "",
+    "of_markers": lambda line: line.subject.markers,
+    "pairs": lambda line: "; ".join(line.others("sentence")[:_EXAMPLES]),
+    "begins": lambda line: (
+        f": its corners begin {line.one.amount:.0f} further in the right view" if line.one.amount else ""
     ),
-    "turns": lambda told: "slides" if told.one.unit == "m" else "turns",
+    "turns": lambda line: "slides" if line.one.unit == "m" else "turns",
     "model_errors": _model_errors,
-    # Of arms of one joint, and of several.
-    "elsewhere": lambda told: "markers farther from its axis" if told.alone else "trials of every joint",
-    "by_itself": lambda told: "" if told.alone else f" in which {told['it']} moves alone",
-    "only": lambda told: "" if told.alone else " alone",
+    # Arms of one joint, and of several.
+    "elsewhere": lambda line: "markers farther from its axis" if line.alone else "trials of every joint",
+    "by_itself": lambda line: "" if line.alone else f" in which {line['it']} moves alone",
+    "only": lambda line: "" if line.alone else " alone",
 }

@@ -1,4 +1,4 @@
-"""Words for what is off in a plan, its motion and its goal."""
+"""Words for errors in a plan, its motion and its goal."""
 
 from projservo_cli.messages.row_form import Row
 
@@ -23,7 +23,7 @@ OF_MOTION = {
     ),
     "dependent_operators": Row("the joints cannot follow: the operators become dependent {at}"),
 }
-# What stops a search through joint space, and by how much the ends of a path relax it.
+# Constraints that stop a search through joint space, and their relaxation at the ends of a path.
 _AWAY = "{amount} ({limit} required)"
 OF_SEARCH = {
     "margin_limits": Row("a joint limit", limit="a joint limit"),
@@ -90,7 +90,7 @@ OF_PLAN = {
     ),
 }
 _CHECK = "check which image is of which camera, and the marker numbers; then take them again"
-# Of a goal that no joints, or no pose of the tool, show.
+# A goal that no joints, or no pose of the tool, show.
 OF_GOAL = {
     "beyond_joints": Row(
         "the task does not lie in what {rest} joints can do: the nearest they bring the face is {amount} rms "
@@ -127,7 +127,7 @@ OF_GOAL = {
     ),
 }
 _NEARER = "show more of its markers, off one line, or show them from nearer"
-# Of an object that carries a goal; names are those of the looks at it.
+# An object that carries a goal; names refer to the frames of it.
 OF_OBJECT = {
     "object_open_infinity": Row(
         "the joints do not determine the plane at infinity, so nothing tells how far an object has moved",

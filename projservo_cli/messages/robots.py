@@ -1,4 +1,4 @@
-"""Words for what is off with a robot, its cameras and a recording."""
+"""Words for errors of a robot, its cameras and a recording."""
 
 from projservo_cli.messages.row_form import Row
 

@@ -69,7 +69,7 @@ VALIDATIONS = {
     ),
     "other_numbers": Row(
         "both views number {count} markers differently at all poses, by the epipolar geometry: {pairs}",
-        "number them alike in both views (the images do not tell which view is right), or remove them",
+        "number them alike in both views (the images do not show which view is right), or remove them",
     ),
     "exchanged_numbers": Row("marker {of_markers[0]} left is marker {of_markers[1]} right"),
     "exchanged_tag": Row("tag {of_markers[0]} left is tag {of_markers[1]} right{begins}"),

@@ -10,11 +10,11 @@ class Verdict(NamedTuple):
 
     when: str  # cause
     remedy: str
-    origin: str = "projservo"  # of the term, as the glossary names it
-    names: tuple[str, ...] = ()  # of keys of the configuration and of values that are about it
+    origin: str = "projservo"  # origin of the term, as the glossary names it
+    names: tuple[str, ...] = ()  # related keys of the configuration and values
     arrived: bool = False  # the goal is reached
-    stopped: str = ""  # what stopped a law, for which another path is searched
-    ends: bool = False  # nothing is driven after it, in this call
+    stopped: str = ""  # cause that stopped a law, so that another path is searched
+    ends: bool = False  # no further motion in this call
     refutes: bool = False  # images contradict the calibration
     retried: bool = False  # a stored run is made again
 
@@ -94,7 +94,7 @@ VERDICTS = {
     "not calibrated": Verdict("a run of a sweep has no calibration", "look why it is refused"),
     "not started": Verdict("a run of a sweep could not begin", "read its reason"),
 }
-# Why another path is searched, but for what stopped the law.
+# Why another path is searched, except causes that stopped the law.
 _REPLANNED = {
     "face_back": "the face was lost, and seen again on the path backwards",
     "ahead": "the path ahead would leave an image",

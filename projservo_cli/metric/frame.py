@@ -7,7 +7,7 @@ into a rigid twist, up to one scale, which a known length fixes. Source of the p
 Base frame, at readings of zero: z along joint 1, x along z × the direction of the first joint that is not
 parallel to it. The origin is on the first revolute axis, at its common normal with the first revolute axis
 that is not parallel to it. Tool frame: origin at the mean of the face, x from its first to its second marker,
-z across the plane of the first two and the next that is off their line.
+z across the plane of the first two and the next that is not on their line.
 
 Cameras on the tool are in the flange frame: the base frame of the arm as seen from its last joint back, so z
 along the last joint. Their pose there is the hand–eye transformation. The markers are points of the base.
@@ -146,7 +146,7 @@ def invariant_upgrade(H_hat: FloatArray, prismatic: BoolArray) -> FloatArray:
 
 
 def invariant_form(L: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Form S (…, 3, 3) of positive trace that actions L (…, n, 3, 3) change least, L S + S Lᵀ.
+    """Form S (…, 3, 3) of positive trace that actions L (…, n, 3, 3) change by a minimum, L S + S Lᵀ.
 
     Also returns the singular values (…, 6) of the changes of all symmetric forms; S is unique if but the last
     is zero.
@@ -211,7 +211,7 @@ def links(axes: FloatArray, prismatic: BoolArray, like: FloatArray) -> tuple[Flo
     angle = np.arctan2((across * _unit(normal)).sum(axis=-1), (d[..., :-1, :] * d[..., 1:, :]).sum(axis=-1))
     way, towards = (np.diff(np.cross(part[..., :3], part[..., 3:]), axis=-2) for part in (axes, like))
     sign = np.copysign(1.0, (towards * normal).sum(axis=-1))
-    # Between parallel axes it lies across both, along the way of those nearby.
+    # Between parallel axes it lies across both, along the direction between neighbours.
     towards = towards - nominal[:-1] * (towards * nominal[:-1]).sum(axis=-1, keepdims=True)
     common = np.where(parallel[:, None], _unit(towards), sign[:, None] * _unit(across))
     distance = (way * common).sum(axis=-1)
@@ -242,14 +242,14 @@ def _frame(x: FloatArray, z: FloatArray, origin: FloatArray) -> FloatArray:
 
 
 def _tool_frame(M: FloatArray, face: Sequence[int], across: int) -> FloatArray:
-    """Pose (…, 4, 4) of the tool frame among markers (…, m, 3), of which one is off the line of the first."""
+    """Pose (…, 4, 4) of the tool frame among markers (…, m, 3), one of which is off the line of the first."""
     start = M[..., face[0], :]
     x, y = M[..., face[1], :] - start, M[..., across, :] - start
     return _frame(x, np.cross(x, y), M[..., [*face], :].mean(axis=-2))
 
 
 class ProjectiveParameters(NamedTuple):
-    """Arrays of a calibration, or of many that are off by its deviations (…)."""
+    """Arrays of a calibration, or of many that differ by its deviations (…)."""
 
     P: FloatArray
     H_hat: FloatArray
@@ -260,7 +260,7 @@ class ProjectiveParameters(NamedTuple):
     def around(cls, c: Calibration, lens: FloatArray, factor: FloatArray) -> "ProjectiveParameters":
         """The calibration, then pairs off by plus and minus a step of each column of the factor.
 
-        ``changes_of`` takes what is computed from each of them.
+        ``changes_of`` takes the results computed from each of them.
         """
         steps = _STEP * np.concatenate([np.zeros((len(factor), 1)), factor, -factor], axis=1).T
         n, B = len(c.H_hat_0), len(steps)
@@ -285,7 +285,7 @@ def changes_of(
 
 
 def _bodies(models: ProjectiveParameters, c: Calibration, face: Sequence[int]) -> MetricParameters:
-    """Bodies (B, …) of models, the first of which decides what frames rest on. Their scale is arbitrary."""
+    """Bodies (B, …) of models, the first of which decides the bases of frames. Their scale is arbitrary."""
     G = invariant_upgrade(models.H_hat, c.prismatic)
     G = G * np.sign(models.M[:, :1] @ G[:, 3, :, None])
     G, M = _right_handed(models, G)
@@ -427,17 +427,18 @@ def _require_metres(length: float, known: FloatArray, between: Scale) -> None:
 class Metric:
     """A calibration in metres, in the base frame of the arm: its arrays, and functions with covariances.
 
-    Cameras on the tool are in the flange frame, and the markers in that of the base. Frames are those of the
-    module ``metric.frame``. Covariances are those of the calibration, to first order, with those of frames
-    and of the known length.
+    Cameras on the tool are in the flange frame, and the markers in the frame of the base. Frames are as in
+    the module ``metric.frame``. Covariances follow from the calibration, to first order, with covariances of
+    frames and of the known length.
     """
 
     view: tuple[str, ...]  # names of the views
-    mount: str  # of the cameras, world or tool
+    mount: str  # mount of the cameras, world or tool
     joint_types: str  # one letter a joint, R or P
     marker: list[int]  # (m,) numbers of the markers
     sigma_px: float  # noise of a pixel, px
-    bodies: MetricParameters  # the model, then pairs off by plus and minus a step of each independent error
+    # the model, then pairs changed by plus and minus a step of each independent error
+    bodies: MetricParameters
     range: FloatArray  # (n, 2) readings in the data, rad or m
     q_reference: FloatArray  # (n,) readings of the reference, rad or m
     curve: JointCurve | None  # true joints by readings; frames at readings of zero are those of true zeros
@@ -541,7 +542,7 @@ class Metric:
 
     @property
     def carrier(self) -> str:
-        """What carries the cameras, and is their frame: ``base`` or ``flange``."""
+        """Carrier of the cameras, which is their frame: ``base`` or ``flange``."""
         return "flange" if self.mount == TOOL else "base"
 
     def cameras(self, q: npt.ArrayLike) -> FloatArray:
@@ -618,7 +619,7 @@ class Metric:
 
         Returns
         -------
-        (…, m, 3) points, m; NaN where fewer than two views have pixels.
+        (…, m, 3) points, m; NaN if fewer than two views have pixels.
 
         Raises
         ------
@@ -677,7 +678,7 @@ class Metric:
 
         Returns
         -------
-        (…, m, 3, 3), m²; NaN where fewer than two views have pixels.
+        (…, m, 3, 3), m²; NaN if fewer than two views have pixels.
 
         Raises
         ------
@@ -695,7 +696,7 @@ class Metric:
         return C.reshape(*shape, 3, 3)
 
     def _by_point(self, X: FloatArray, seen: BoolArray) -> FloatArray:
-        """Derivative (K, 2 V, 3) of pixels by points (K, 3); zero where a view (V, K) sees none."""
+        """Derivative (K, 2 V, 3) of pixels by points (K, 3); zero if a view (V, K) sees none."""
         P = self.body.P
         by_point = projection_derivative(P, self.body.lens, homogeneous(X))[1] @ P[:, None, :, :3]
         return np.where(seen[..., None, None], by_point, 0.0).swapaxes(0, 1).reshape(len(X), -1, 3)

@@ -41,7 +41,7 @@ _MAX_ZERO, _MAX_TILT = np.radians(45.0), np.radians(10.0)
 _MAX_OFFSET, _BEYOND = 0.05, 4.0
 # χ² per degree of freedom above which other hypotheses are tried, and the share that a true one leaves of it.
 _DOUBTED, _DECISIVE = 4.0, 0.25
-# Ratio of χ² within which hypotheses are equal, as joint 1 reversed and the zero of joint 2 off by 180°.
+# Ratio of χ² within which hypotheses are equal, as joint 1 reversed and the zero of joint 2 wrong by 180°.
 _EQUAL = 1.5
 # Number of angles at which a joint starts, number of starts that are fitted, and their largest ratio of χ².
 _ANGLES, _FITTED, _NEAR_BEST = 72, 8, 30.0
@@ -53,7 +53,7 @@ class _JointError(NamedTuple):
     """Error of the model at one joint, each with its standard deviation."""
 
     joint: int  # number of the joint, from 1
-    zero: float | None  # rad or m to add to readings before the model takes them; None where it is gauge
+    zero: float | None  # rad or m to add to readings before the model takes them; None if it is gauge
     zero_std: float | None  # rad or m
     offset_m: float  # distance of the calibrated axis from the model's, at the point nearest to the tool
     offset_std_m: float  # m
@@ -66,7 +66,7 @@ class KinematicErrors(NamedTuple):
 
     joints: list[_JointError]
     length: float  # share by which the known length is too short for the links of the model
-    length_std: float  # its standard deviation, which grows with what the model leaves beyond its own errors
+    length_std: float  # its standard deviation, which grows with residuals of the model beyond its errors
 
 
 class _ModelFit:
@@ -140,7 +140,7 @@ class _ModelFit:
         return self
 
     def zeros(self) -> FloatArray:
-        """Zeros (n,), rad or m, those of revolute joints within half a turn."""
+        """Zeros (n,), rad or m, for revolute joints within half a turn."""
         zeros = _zeros_of(self.x, len(self.model_axes))
         around = ~self.prismatic & (np.abs(zeros) > np.pi)
         return np.where(around, (zeros + np.pi) % (2.0 * np.pi) - np.pi, zeros)
@@ -183,7 +183,7 @@ class _ModelFit:
         return [Finding("far_axis", REFUSES, joint, off, limit=most, unit="m" if kind else "rad")]
 
     def left(self, x: FloatArray, calibrated: FloatArray, factor: float = 1.0) -> FloatArray:
-        """Differences (…, 6 n) of axes (…, n, 6) from those of the model, its lengths times a factor."""
+        """Differences (…, 6 n) of axes (…, n, 6) from the axes of the model, its lengths times a factor."""
         base, model_axes = self._base.copy(), self.model_axes.copy()
         base[:3, 3] *= factor
         model_axes[~self.prismatic, 3:] *= factor
@@ -200,7 +200,7 @@ class _ModelFit:
 def _model_fit(metric: Metric, model_axes: FloatArray) -> _ModelFit:
     """Fit a model, and refuse one that another sense, order or far zero of joints would fit better.
 
-    Raises WorkFailed naming it, or the axis that is off, where the model does not describe the arm.
+    Raises WorkFailed naming it, or the wrong axis, if the model does not describe the arm.
     """
     fit = _ModelFit(metric, model_axes).fitted()
     wrong = fit.implausible() or fit.differences()
@@ -215,15 +215,15 @@ def _model_fit(metric: Metric, model_axes: FloatArray) -> _ModelFit:
         if metric.prismatic[i] == metric.prismatic[j]:
             starts.append(_ModelFit(metric, model_axes, order=order))
     starts = [start.aligned() for start in starts]
-    least = min(start.chi2 for start in starts)
-    near = [start for start in starts if start.chi2 <= _NEAR_BEST * least]
+    min_chi2 = min(start.chi2 for start in starts)
+    near = [start for start in starts if start.chi2 <= _NEAR_BEST * min_chi2]
     near = sorted(near, key=lambda other: (len(other.differences()), other.chi2))[:_FITTED]
     fits = [other for other in (start.fitted() for start in near) if not other.implausible()]
-    least = min((other.chi2 for other in fits), default=np.inf)
-    equal = [other.differences() for other in fits if other.chi2 <= _EQUAL * least]
+    min_chi2 = min((other.chi2 for other in fits), default=np.inf)
+    equal = [other.differences() for other in fits if other.chi2 <= _EQUAL * min_chi2]
     fewest = min(map(len, equal), default=0)
     best = sorted((found for found in equal if len(found) == fewest), key=lines)  # senses before zeros
-    if fewest and (wrong or least < _DECISIVE * fit.chi2):
+    if fewest and (wrong or min_chi2 < _DECISIVE * fit.chi2):
         wrong = best[0] + [Finding("undecided_model", others=tuple(other)) for other in best[1:2]]
     if wrong:
         raise failed([Finding("other_model", REFUSES, others=tuple(wrong))])
@@ -262,10 +262,10 @@ def kinematic_errors(metric: Metric, model_axes: FloatArray) -> KinematicErrors:
 
 
 def in_model_frames(metric: Metric, model_axes: FloatArray, tip: FloatArray) -> Metric:
-    """Express a metric in the base of a model, and its tool, or flange, in that of the model's tip.
+    """Express a metric in the base of a model, and its tool, or flange, in the frame of the model's tip.
 
     The base is where it fits the calibrated axes best; the tip is where the model has it, with the zeros that
-    were found. Covariances include those of both.
+    were found. Covariances include the errors of both.
 
     model_axes : (n, 6) screws of the model at readings of zero, rad and m; tip : (4, 4) its tip there, m.
     Raises InputError if the joint types differ, WorkFailed if the model is not of this arm.
@@ -287,7 +287,7 @@ def in_model_frames(metric: Metric, model_axes: FloatArray, tip: FloatArray) -> 
 def _length_error(r: FloatArray, J: FloatArray, across: FloatArray) -> tuple[float, float]:
     """Error of the known length and its deviation, by whitened residuals (6 n,) of a fit and its J.
 
-    across : (6 n,) their derivative by the scale of the model, less what the fit makes up for.
+    across : (6 n,) their derivative by the scale of the model, less the part that the fit compensates.
     """
     information = float(across @ across)
     share = float(across @ r) / information
@@ -302,7 +302,7 @@ def _placed(base: FloatArray, x: FloatArray) -> FloatArray:
 
 
 def _zeros_of(x: FloatArray, n: int) -> FloatArray:
-    """Zeros (…, n) of all joints by fitted numbers (…, 6 + n - 2); those of the ends are gauge."""
+    """Zeros (…, n) of all joints by fitted numbers (…, 6 + n - 2); the end zeros are gauge."""
     zeros = np.zeros((*x.shape[:-1], n))
     zeros[..., 1 : n - 1] = x[..., 6:]
     return zeros
@@ -323,7 +323,7 @@ def _differences(
 
 # Deviations beyond which the links of a model contradict the known length.
 _CONTRADICTED = 4.0
-# Relative deviation of a known length that is not given, as by a ruler, and that of an axis by rounding.
+# Relative deviation of a known length whose error is not given, as by a ruler, and of an axis by rounding.
 _UNMEASURED, _ROUNDING = 0.0025, 1e-9
 # Largest distance of a tool or a camera from the base, m.
 _FARTHEST = 20.0
@@ -332,33 +332,33 @@ _FARTHEST = 20.0
 def length_contradictions(
     metric: Metric, errors: KinematicErrors | None, *, measured: bool
 ) -> Iterator[Finding]:
-    """Yield what contradicts the known length: far cameras, readings of prismatic joints, links of a model.
+    """Yield contradictions of the known length: far cameras, readings of prismatic joints, links of a model.
 
     measured : whether the deviation of the length is known; otherwise one per cent passes.
     """
-    least = _ROUNDING if measured else _UNMEASURED
+    min_chi2 = _ROUNDING if measured else _UNMEASURED
     of_axes = metric.deviations("axes")
     for i in np.flatnonzero(metric.prismatic):
         v = metric.axes[i, 3:]
         size = float(np.linalg.norm(v))
         std = float(np.linalg.norm(of_axes[:, i, 3:] @ v)) / size
-        if abs(size - 1.0) > _CONTRADICTED * np.hypot(std, least):
+        if abs(size - 1.0) > _CONTRADICTED * np.hypot(std, min_chi2):
             yield Finding("length_by_joint", REFUSES, Subject(joints=(int(i) + 1,)), size, std, unit="1")
-    if errors is not None and abs(errors.length) > _CONTRADICTED * np.hypot(errors.length_std, least):
+    if errors is not None and abs(errors.length) > _CONTRADICTED * np.hypot(errors.length_std, min_chi2):
         code = "length_short" if errors.length > 0.0 else "length_long"
         yield Finding(code, REFUSES, amount=errors.length, deviation=errors.length_std, unit="1")
     hand = "flange" if metric.mount == TOOL else "tool"
-    places = [
+    carriers = [
         ("far_camera", Subject(views=(view,), name=metric.carrier), T)
         for view, T in zip(metric.view, metric.poses, strict=True)
     ]
-    for code, of, T in (*places, ("far_hand", Subject(name=hand), metric.body.tool)):
+    for code, of, T in (*carriers, ("far_hand", Subject(name=hand), metric.body.tool)):
         if (far := float(np.linalg.norm(T[:3, 3]))) > _FARTHEST:
             yield Finding(code, REFUSES, of, far, limit=_FARTHEST, unit="m")
 
 
 def errors_found(errors: KinematicErrors, joint_types: str) -> Iterator[Finding]:
-    """Yield what to mend in a model: zeros of joints, then axes, of each the most significant first."""
+    """Yield corrections of a model: zeros of joints, then axes, each by significance."""
     zeros = [one for one in errors.joints if one.zero is not None and one.zero_std is not None]
     for one in sorted(zeros, key=lambda one: -abs((one.zero or 0.0) / (one.zero_std or 1.0))):
         of, unit = Subject(joints=(one.joint,)), "m" if joint_types[one.joint - 1] == "P" else "rad"

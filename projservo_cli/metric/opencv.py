@@ -17,12 +17,12 @@ _MOVED = ("lens", "poses", "axes", "tool", "markers")
 
 
 class OpenCV(NamedTuple):
-    """Robot and rig whose cameras are OpenCV's, and what that costs."""
+    """Robot and rig whose cameras are OpenCV's, and the loss in accuracy."""
 
     body: MetricParameters  # without lenses
     distortion: FloatArray  # (V, 5) k1, k2, p1, p2, k3
     skew_chi2: float  # increase of the squared residuals over the squared noise, for no skew
-    lens_chi2: float  # the same for its lens, all else as it is
+    lens_chi2: float  # the same for its lens, with the rest as it is
     lens_rms_px: float  # difference between both lenses where markers were seen, px
 
     @property
@@ -44,7 +44,7 @@ def opencv_cameras(metric: Metric, calibration: Calibration) -> OpenCV:
     All else moves along by the covariance. The lens is fitted to the calibrated one where markers were seen;
     its two terms of tangential distortion carry it to the principal point.
 
-    calibration : that of the metric; one that kept no detections has a lens fitted over its radius.
+    calibration : of the metric; one that kept no detections has a lens fitted over its radius.
     """
     K, of_K = metric.K, metric.deviations("K")
     skew = of_K[..., 1]
@@ -77,7 +77,7 @@ def opencv_cameras(metric: Metric, calibration: Calibration) -> OpenCV:
 
 
 def _straight_detections(calibration: Calibration) -> list[FloatArray]:
-    """Undistorted pixels (k, 2) of the detections of each view, as predicted; (0, 2) where none are kept."""
+    """Undistorted pixels (k, 2) of the detections of each view, as predicted; (0, 2) if none are kept."""
     if calibration.corner_q is None or calibration.corner_squares is None or calibration.lens is None:
         return [np.zeros((0, 2))] * len(calibration.P)
     seen = np.isfinite(calibration.corner_squares).swapaxes(0, 1).reshape(len(calibration.P), -1)
@@ -102,7 +102,7 @@ def _terms(x: FloatArray) -> FloatArray:
 
 
 def _fitted_lens(K: FloatArray, lens: FloatArray, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Coefficients (5,) of OpenCV's lens nearest to a lens (5,), and squares (k,) of what is left, px².
+    """Coefficients (5,) of OpenCV's lens nearest to a lens (5,), and squares (k,) of the residuals, px².
 
     pixels : (k, 2) undistorted, at which it is fitted; without any, the disk within the radius of the lens.
     """

@@ -14,7 +14,7 @@ from projservo_cli.records import MM, FloatArray, InputError, IntArray, WorkFail
 _UNKNOWNS = 10
 # Minimum number of positions that a fit takes, three coordinates each, with some to spare.
 _MIN_POSITIONS = 6
-# Axes of a mirrored frame; it is taken for that of the instrument where it leaves less than this of χ².
+# Axes of a mirrored frame; it is taken for the frame of the instrument if it leaves less than this of χ².
 _MIRROR, _MIRRORED = np.array([1.0, 1.0, -1.0]), 0.01
 # Number of parts that a table is divided into when it is fitted itself.
 _PARTS = 5
@@ -71,7 +71,7 @@ def _least_squares(T: FloatArray, xyz: FloatArray) -> Any:
     """Fit of a link to positions (K, 3) at poses (K, 4, 4) of the tool, m."""
     t = T[:, :3, 3]
     centered, target = t - t.mean(axis=0), xyz - xyz.mean(axis=0)
-    # With the point at the tool's origin, and the scale that S. Umeyama gives with the rotation.
+    # Take the point at the tool's origin, and the scale that S. Umeyama gives with the rotation.
     rotation = aligned(centered[None], target[None], np.ones((1, len(t))))[0][0]
     scale = float((target * (centered @ rotation.T)).sum() / (centered**2).sum())
     shift = xyz.mean(axis=0) - scale * rotation @ t.mean(axis=0)

@@ -1,1 +1,1 @@
-"""Fault detection in the loop: images that disagree with the calibration, and what explains them."""
+"""Fault detection in the loop: images that disagree with the calibration, and their explanations."""

@@ -1,4 +1,4 @@
-"""Accuracy of an arrival: pixels by which images are off, or may be, carried to the face in millimetres."""
+"""Accuracy of an arrival: actual or possible image errors, px, carried to the face in millimetres."""
 
 import math
 from collections.abc import Sequence
@@ -23,9 +23,9 @@ from projservo_cli.monitoring.innovation_tests import (
 )
 from projservo_cli.records import MM, BoolArray, Calibration, FloatArray, InputError, Model, changed
 
-# Variance of corners from a side that the calibration has not seen, over that of others; chance of a test.
+# Variance of corners from a side that the calibration has not seen, over other corners; chance of a test.
 _UNUSUAL, _CHANCE = 2.0, 1e-4
-# Share of detections that may be off by themselves, and deviation of a pose that is not known, over noise.
+# Share of detections that may be inconsistent, and deviation of a pose that is not known, over noise.
 _ALONE, _FREE = 0.25, 1e4
 # Steps of Gauss and Newton towards a pose that is some degrees away.
 _STEPS = 4
@@ -79,8 +79,8 @@ class Posture:
     def _moved(self, face: FloatArray, has: BoolArray, lengths: FloatArray) -> FloatArray:
         """Displacements (d, f 3), m, of the face by motions of the tool.
 
-        Where the axes of the arm leave its metric open they are those across the lines of sight (d, V f 2),
-        by the pair of corners with the least foreshortening.
+        If the axes of the arm leave its metric open they are those across the lines of sight (d, V f 2),
+        by the pair of corners with the smallest foreshortening.
         """
         d, X = len(self._twists), metric_points(self._model, face)
         if X is None:
@@ -112,11 +112,11 @@ class Posture:
 class RigidFit(NamedTuple):
     """Images of one instant against the calibrated tool in any pose, whether joints reach it or not."""
 
-    agrees: bool  # whether chance explains what is left, and the shift
-    reached: bool  # whether it explains what is left where the joints show it best, too
+    agrees: bool  # whether chance explains the residuals, and the shift
+    reached: bool  # whether it explains the residuals where the joints show it best, too
     rms_px: float  # residual of a coordinate
-    limit_px: float  # of it by chance, with the deviations of the images and of the calibration
-    seen: BoolArray  # (V, m) but for detections that are off by themselves
+    limit_px: float  # limit of the shift by chance, with the deviations of the images and of the calibration
+    seen: BoolArray  # (V, m) without inconsistent detections
     off_px: FloatArray  # (V, m) residual of each detection, px; 0 where unseen
     view: int  # whose image seems to be shifted against the others: of two the first, of more the likeliest
     shift: FloatArray  # (2,) by which, px; nothing by one view
@@ -125,7 +125,7 @@ class RigidFit(NamedTuple):
     turn: float  # angle between both, rad
 
     def off_mm(self, posture: Posture, M: FloatArray) -> float:
-        """Return how far off the face may be, mm, where one of the images is shifted within chance."""
+        """Return the possible error of the face, mm, if one of the images is shifted within chance."""
         carry = posture.carry(M, self.seen).reshape(-1, *self.seen.shape, 2)[:, self.view].sum(axis=1)
         may = DISTINCT**2 * np.trace(carry @ self.covariance @ carry.T)
         return float(np.sqrt(np.square(carry @ self.shift).sum() + may))
@@ -155,7 +155,7 @@ def rigid_fit(calibration: Calibration, q: FloatArray, images: FloatArray, sigma
     rows = coordinate_rows(np.flatnonzero(left))
     P, r, r_joints = np.linalg.inv(free[np.ix_(rows, rows)]), at.r[rows], by_joints.r[rows]
     view_of, shifts = view_of[rows], []
-    # Of two images one is shifted against the other; a single one shows no more than another pose.
+    # One of two images is shifted against the other; a single one shows no more than another pose.
     for view in {*range(V if V > 2 else V - 1)} & {*view_of.tolist()}:
         F = np.eye(2)[rows % 2] * (view_of == view)[:, None]
         covariance = np.linalg.inv(F.T @ P @ F)
@@ -164,7 +164,7 @@ def rigid_fit(calibration: Calibration, q: FloatArray, images: FloatArray, sigma
     none = 0.0, 0, np.zeros(2), np.zeros((2, 2))
     chi2, view, shift, covariance = max(shifts, key=lambda found: found[0], default=none)
     joints = np.linalg.solve(_free(by_joints, by_joints.F[:, :n])[np.ix_(rows, rows)], r_joints)
-    # χ² of the shift, of what is left, and of that where joints show it best, over their limits.
+    # χ² of the shift, of the residuals, and of residuals where joints show it best, over their limits.
     bias = 2.0 * float(np.square(errors.bias_px / at.noise).ravel()[left].sum())
     freedom = np.maximum([2, len(rows) - len(errors.twists), len(rows) - n], 1)
     squares = np.array([chi2, r @ P @ r, r_joints @ joints])
@@ -189,7 +189,7 @@ def resting_error_mm(
 ) -> float | None:
     """Return how far a face at rest may be from where its joints put it, rms mm, by images that agree.
 
-    The error of the images, and the shift of one of them that no test shows. None where no length is known,
+    The error of the images, and the shift of one of them that no test shows. None if no length is known,
     or less than two views, or the only one, show three markers.
 
     q : (n,) joint readings, rad or m; face : numbers of its markers; lengths : (f, f) between them, m, NaN if

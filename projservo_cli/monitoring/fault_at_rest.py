@@ -1,4 +1,4 @@
-"""One question of an arm at rest: what changed since its calibration, by the frames of one posture."""
+"""One question of an arm at rest: the change since its calibration, by the frames of one posture."""
 
 from dataclasses import replace
 
@@ -16,29 +16,29 @@ _SINGLE = 1000
 
 def fault_at_rest(
     calibration: Calibration,
-    shown: Observation,
+    frames: Observation,
     image_size: FloatArray | None = None,
     *,
     sigma_px: float = 0.0,
     fresh: BoolArray | None = None,
 ) -> Finding | None:
-    """Return what changed since the calibration, by frames of an arm at rest; None for nothing.
+    """Return the change since the calibration, by frames of an arm at rest; None if there is none.
 
     Frames are taken in one after the other, as ``servo`` does before the first motion, and then their mean
     is tested. ``doctor``, ``servo``, ``plan``, ``validate`` and ``teach`` ask this question.
 
-    shown : frames, of markers that the calibration does not know among others.
+    frames : observation of markers that the calibration does not know among others.
     image_size : (V, 2) px, None if unknown.
-    sigma_px : pixel noise per coordinate where that is more than the calibration's.
+    sigma_px : pixel noise per coordinate if that is more than the calibration's.
     fresh : (K, V) whether a view has a new frame in each; None all.
     """
     if not calibration.usable:
         return None
-    shown = _of_known_markers(calibration, shown)
+    frames = _of_known_markers(calibration, frames)
     sigma_px = max(calibration.sigma_px, calibration.sigma_fitted_px, sigma_px)
-    if len(shown.q) == 1:
-        return _fault_of_one(calibration, shown, image_size, sigma_px)
-    monitor = _monitor_after(calibration, shown, image_size, sigma_px, fresh)
+    if len(frames.q) == 1:
+        return _fault_of_one(calibration, frames, image_size, sigma_px)
+    monitor = _monitor_after(calibration, frames, image_size, sigma_px, fresh)
     return monitor.give_up() or fault_of_mean(monitor)
 
 
@@ -49,18 +49,18 @@ def fault_of_mean(monitor: ImageMonitor) -> Finding | None:
     return _fault_of_one(monitor.calibration, mean, monitor.image_size, monitor.sigma_px)
 
 
-def _of_known_markers(calibration: Calibration, shown: Observation) -> Observation:
+def _of_known_markers(calibration: Calibration, frames: Observation) -> Observation:
     """Images of the markers of a calibration."""
-    images = np.array([at_known_markers(calibration, shown.marker, frame) for frame in shown.images])
-    sigma = shown.sigma
+    images = np.array([at_known_markers(calibration, frames.marker, frame) for frame in frames.images])
+    sigma = frames.sigma
     if sigma is not None:
-        sigma = np.array([at_known_markers(calibration, shown.marker, frame) for frame in sigma])
-    return replace(shown, marker=calibration.marker, images=images, sigma=sigma)
+        sigma = np.array([at_known_markers(calibration, frames.marker, frame) for frame in sigma])
+    return replace(frames, marker=calibration.marker, images=images, sigma=sigma)
 
 
 def _monitor_after(
     calibration: Calibration,
-    shown: Observation,
+    frames: Observation,
     image_size: FloatArray | None,
     sigma_px: float,
     fresh: BoolArray | None = None,
@@ -68,7 +68,7 @@ def _monitor_after(
     """Monitor that has taken in all frames."""
     V = len(calibration.P)
     monitor, rest = ImageMonitor(calibration, sigma_px, _SINGLE, image_size=image_size), np.zeros(V)
-    for k, (q, images) in enumerate(zip(shown.q, shown.images, strict=True)):
+    for k, (q, images) in enumerate(zip(frames.q, frames.images, strict=True)):
         monitor.observe(
             rest + k,
             np.stack([q] * V),
@@ -76,35 +76,35 @@ def _monitor_after(
             rest,
             images,
             np.ones(V, dtype=np.bool_) if fresh is None else fresh[k],
-            stated=None if shown.sigma is None else shown.sigma[k],
+            stated=None if frames.sigma is None else frames.sigma[k],
         )
     return monitor
 
 
 def _fault_of_one(
-    calibration: Calibration, shown: Observation, image_size: FloatArray | None, sigma_px: float
+    calibration: Calibration, frames: Observation, image_size: FloatArray | None, sigma_px: float
 ) -> Finding | None:
-    """Return what one frame shows.
+    """Return the fault in one frame.
 
-    Tags that are off by themselves by less than ``LEAST_MOVED_PX``, up to half of them, are no change: one
-    view of the tool does not tell a tag that moved from one that is bent, or under a slant.
+    Single tags that are inconsistent by less than ``LEAST_MOVED_PX``, up to half of them, are no change: one
+    view of the tool cannot separate a moved tag from a bent or slanted one.
     """
     numbers = calibration.marker
 
     def fault_of(pixels: FloatArray) -> Finding | None:
-        one = replace(shown, images=pixels[None])
+        one = replace(frames, images=pixels[None])
         monitor = _monitor_after(calibration, one, image_size, sigma_px)
-        if monitor.rejected.any() and not monitor.pending:  # what is off by itself must be so for long
+        if monitor.rejected.any() and not monitor.pending:  # single errors must last
             often = np.zeros(NAMED_AT[-1 if len(pixels) == 1 else 0], dtype=np.int64)
-            sigma = None if shown.sigma is None else shown.sigma[often]
-            many = replace(shown, q=shown.q[often], images=one.images[often], sigma=sigma)
+            sigma = None if frames.sigma is None else frames.sigma[often]
+            many = replace(frames, q=frames.q[often], images=one.images[often], sigma=sigma)
             monitor = _monitor_after(calibration, many, image_size, sigma_px)
         return monitor.give_up()
 
-    pixels = shown.images[0]
+    pixels = frames.images[0]
     if (fault := fault_of(pixels)) is None:
         return None
-    off, tags = pixels - predict(calibration, shown.q)[0], numbers // CORNERS
+    off, tags = pixels - predict(calibration, frames.q)[0], numbers // CORNERS
     for _ in range(len(np.unique(tags[np.isfinite(off).any(axis=(0, 2))])) // 2):
         tag = _off_alone(off[np.isfinite(off).any(axis=(1, 2))], numbers)
         if not tag.any():
@@ -116,9 +116,9 @@ def _fault_of_one(
 
 
 def _off_alone(off: FloatArray, numbers: IntArray) -> BoolArray:
-    """Markers (m,) of the tag that is the farthest off (V, m, 2), px; none where that is far, or most of all.
+    """Markers (m,) of the tag that is the farthest off (V, m, 2), px; none if that is far, or most of all.
 
-    Errors of joints move all of them: a tag is off against the median of the others.
+    Errors of joints move all of them: a tag is compared with the median of the others.
     """
     detected: BoolArray = np.isfinite(off[..., 0])
     tags = numbers // CORNERS

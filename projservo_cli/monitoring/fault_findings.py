@@ -9,9 +9,9 @@ from projservo_cli.findings import REFUSES, Finding, Subject
 from projservo_cli.monitoring.hypotheses import ALL, Explanation
 from projservo_cli.records import CORNERS, Calibration, FloatArray, IntArray
 
-# By so much a link may flex under its load, rad, which looks like a joint that slipped.
+# Angle by which a link may flex under its load, rad, which looks like a joint that slipped.
 _FLEXIBLE = np.radians(1.0)
-# A tag that is off by less than this share of its side is neither turned by quarters nor exchanged; share of
+# A tag that errs by less than this share of its side is neither turned by quarters nor exchanged; share of
 # that which may be left where it is.
 _SIDE, _FITS = 0.5, 0.15
 
@@ -52,7 +52,7 @@ def finding_of(explanation: Explanation, calibration: Calibration) -> Finding:
 
 
 def _displaced(explanation: Explanation, calibration: Calibration) -> Finding:
-    """Return the finding on markers that moved on the tool or in the scene, those of a tag together."""
+    """Return the finding on markers that moved on the tool or in the scene, markers of a tag together."""
     moved = sorted(int(calibration.marker[j]) for j in explanation.cause.markers)
     whole = len(moved) == CORNERS and moved[0] // CORNERS == moved[-1] // CORNERS
     subject = Subject(markers=tuple(moved), tag=moved[0] // CORNERS if whole else None)

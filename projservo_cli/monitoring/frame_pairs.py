@@ -8,7 +8,7 @@ from projservo_cli.records import Calibration, FloatArray, IntArray
 
 # Frames of all views within this time, s, are one observation; number that waits for the other views.
 _TOGETHER_S, _WAITING = 0.025, 25
-# Between readings joints are taken to go straight: they are off by this share of the time times the change of
+# Between readings joints are taken to go straight: they err by this share of the time times the change of
 # their speed at most.
 _STRAIGHT = 1.0 / 8.0
 
@@ -33,11 +33,11 @@ class FramePair(NamedTuple):
     sigma_t: FloatArray  # (V,) s
     images: FloatArray  # (V, m, 2) px
     noise: FloatArray  # (V, m) px
-    curved: FloatArray  # (n,) how far joints may be off since they do not go straight between readings
+    curved: FloatArray  # (n,) possible error of joints since they do not go straight between readings
 
     @classmethod
     def at_rest(cls, q: FloatArray, images: FloatArray, noise: FloatArray) -> "FramePair":
-        """Images (V, m, 2) of an arm that stands still at joints (n,), with deviations (V, m) of pixels."""
+        """Images (V, m, 2) of an arm at rest at joints (n,), with deviations (V, m) of pixels."""
         V = len(images)
         none, at_rest = np.zeros(V), np.zeros((V, len(q)))
         return cls(none, np.stack([q] * V), at_rest, none, images, noise, np.zeros(len(q)))
@@ -61,7 +61,7 @@ class Pairing:
         self._reached = np.maximum(self._reached, t)
 
     def next(self, at_rest: bool) -> FramePair | None:
-        """Next observation; None while a frame waits for those of the other views.
+        """Next observation; None while a frame waits for frames of the other views.
 
         at_rest : the robot has not moved yet, so that frames of any two instants show the same.
         """
@@ -98,7 +98,7 @@ def at_known_markers(calibration: Calibration, marker: IntArray, images: FloatAr
 
 
 def mean_image(images: FloatArray) -> FloatArray:
-    """Mean (…, 2) of images (K, …, 2) of an arm that stands still; NaN where most show no marker."""
+    """Mean (…, 2) of images (K, …, 2) of an arm at rest; NaN where most show no marker."""
     often, mean = 2 * np.isfinite(images).sum(axis=0) > len(images), np.full(images.shape[1:], np.nan)
     mean[often] = np.nanmean(images[:, often], axis=0)
     return mean

@@ -16,21 +16,21 @@ from projservo_cli.monitoring.frame_pairs import FramePair
 from projservo_cli.monitoring.innovation_tests import ErrorModel, Residual, Sums
 from projservo_cli.records import CORNERS, BoolArray, FloatArray, IntArray
 
-# A point that a cause puts behind a camera is off by so much, px.
+# A point that a cause puts behind a camera gets this error, px.
 _HIDDEN_PX = 1e3
 # Steps of a fit, and the change of parameters that derivatives are taken by.
 _STEPS, _EPSILON = 14, 1e-6
-# A cause that changes images by more than this, px, is far off.
+# A cause that changes images by more than this, px, is large.
 _NEAR_PX = 5.0
 # Causes of several parameters that are fitted, the likeliest after one step; a fall of χ² that ends a fit.
 _FITTED, _FALLS = 8, 0.05
 # Starts of a joint that was homed again.
 _TURNS = 12
-# By so much a link may flex under its load, rad, which looks like a joint that slipped.
+# Angle by which a link may flex under its load, rad, which looks like a joint that slipped.
 _MOST_FLEXIBLE = np.radians(3.0)
 # Numbers of all joints, views or markers of a cause, and of some of several.
 ALL, _SOME = -1, -2
-# Readings that differ by no more stand still, rad or m.
+# Readings that differ by no more are at rest, rad or m.
 _STILL = 1e-9
 # Most observations that are explained together.
 _MAX_PAIRS = 12
@@ -55,7 +55,8 @@ class _Cause(NamedTuple):
     starts: FloatArray  # (s, p) parameters that a fit starts from
     change: Callable[[_Changed, FloatArray], _Changed]
     markers: tuple[int, ...] = ()  # that it touches alone
-    views: tuple[int, ...] = ()  # of whose cameras it is; for an exchange the camera that each view shows
+    # views whose cameras it concerns; for an exchange the camera that each view shows
+    views: tuple[int, ...] = ()
 
     @property
     def row(self) -> Deviation:
@@ -68,10 +69,10 @@ class Explanation(NamedTuple):
 
     cause: _Cause
     theta: FloatArray  # (p,)
-    gain: float  # by which χ² falls
-    cost: float  # of its parameters, by their prior
+    gain: float  # decrease of χ²
+    cost: float  # cost of its parameters, by their prior
     left: float  # χ² that stays
-    changed_px: float  # by how much it changes images of the markers that it touches, rms
+    changed_px: float  # rms change of images of the markers that it touches
     min_px: float  # the same in the second view, or in the only one
     seen_px: float  # length of this change that the images show, rms: errors of joints take none of it
 
@@ -118,7 +119,7 @@ class Evidence:
         onset = float(self.pairs[0].t.mean())
         seconds = float(self.pairs[-1].t.mean()) - onset
         nuisance = np.array([np.hstack([r.B, r.F[:, : errors.fixed]]) for r in residuals])
-        drift = slice(errors.e + n, errors.e + 2 * n)  # of joints, with time from the onset
+        drift = slice(errors.e + n, errors.e + 2 * n)  # drift of joints, with time from the onset
         nuisance[..., drift] -= onset * nuisance[..., errors.e : errors.e + n]
         self._beside = self._whitened(nuisance)
         sigma_t = np.maximum(np.max([pair.sigma_t for pair in self.pairs], axis=0), 1e-6)
@@ -173,7 +174,7 @@ class Evidence:
     def explanations(self, causes: Iterable[_Cause]) -> list[Explanation]:
         """Fits of the causes that a first step of each makes the likeliest, and of all with one parameter.
 
-        The first step of a joint that is far off says little, since its images move on curves.
+        The first step of a joint with a large error says little, since its images move on curves.
         """
         tried = [self._tried(cause) for cause in causes]
         tried.sort(key=lambda trial: -trial[0])
@@ -184,14 +185,14 @@ class Evidence:
         ]
 
     def _refitted(self, fit: Explanation) -> Explanation:
-        """Explanation of a cause that is far off, with errors of joints and calibration as they act there.
+        """Explanation of a large cause, with errors of joints and calibration as they act there.
 
         The fit takes observations back to the state without the cause, and fits its remainder there.
         """
         kind, changed = fit.cause.kind, fit.cause.change(self.nothing, fit.theta)
         if not fit.cause.row.undone or fit.changed_px < _NEAR_PX:
             return fit
-        # What each view shows as it was calibrated: of an exchange another one, of other markers.
+        # Images of each view as calibrated: for an exchange of another view, or of other markers.
         order = np.argsort(fit.cause.views) if kind == "exchanged" else np.arange(self.seen.shape[1])
         pairs, seen_there = [], self.seen[:, order]
         for pair, seen, away in zip(self.pairs, seen_there, changed.away, strict=True):
@@ -287,7 +288,7 @@ class Evidence:
 def causes_of(evidence: Evidence, numbers: IntArray, centre: FloatArray | None) -> Iterator[_Cause]:
     """All causes that may be named, the simplest of a kind first.
 
-    numbers : (m,) of the markers; centre : (V, 2) of the images, px; None where their size is not known.
+    numbers : (m,) of the markers; centre : (V, 2) of the images, px; None if their size is not known.
     """
     views = len(evidence.scene.P)
     yield from _exchanges(views)
@@ -307,8 +308,10 @@ def _exchanges(views: int) -> Iterator[_Cause]:
         for turn in range(1, len(some)):
             order = np.arange(views)
             order[[*some]] = np.roll(some, turn)
-            shown = order.tolist()
-            yield _Cause("exchanged", ALL, _start(0), partial(exchanged, order=shown), views=tuple(shown))
+            permuted = order.tolist()
+            yield _Cause(
+                "exchanged", ALL, _start(0), partial(exchanged, order=permuted), views=tuple(permuted)
+            )
 
 
 def _every_and_all(views: int) -> list[tuple[int, tuple[int, ...]]]:
@@ -344,7 +347,7 @@ def _joint_causes(evidence: Evidence) -> Iterator[_Cause]:
     def flexible(s: _Changed, theta: FloatArray) -> _Changed:
         return s._replace(away=s.away + theta)
 
-    def late(s: _Changed, theta: FloatArray, views: tuple[int, ...]) -> _Changed:
+    def delayed(s: _Changed, theta: FloatArray, views: tuple[int, ...]) -> _Changed:
         delays = np.zeros(V)
         delays[[*views]] = theta
         return s._replace(away=s.away - delays[:, None] * velocity)
@@ -356,18 +359,18 @@ def _joint_causes(evidence: Evidence) -> Iterator[_Cause]:
         yield _Cause("slipped", i, starts, partial(slipped, i=i))
     still, lately = np.ptp(q, axis=(0, 1)) <= _STILL, np.ptp(q[K // 2 :], axis=(0, 1)) <= _STILL
     if K > 1 and not still.all():
-        # The first images may show what was before: an onset is told by what disagrees, and images are late.
+        # The first images may precede the onset: disagreement reveals an onset, and images have latency.
         for i in np.flatnonzero(still | (lately & (not lately.all()))).tolist():
             yield _Cause("frozen", i, _start(K), partial(frozen, which=slice(i, i + 1)))
     elif K > 2:
         yield _Cause("frozen", ALL, _start(n * K), partial(frozen, which=slice(n)))
     yield _Cause("flexible", ALL, _start(n), flexible)
     for v, views in _every_and_all(V) if velocity.any() else ():
-        yield _Cause("late", v, _start(len(views)), partial(late, views=views), views=views)
+        yield _Cause("late", v, _start(len(views)), partial(delayed, views=views), views=views)
 
 
 def _image_causes(count: int, centre: FloatArray | None) -> Iterator[_Cause]:
-    """Causes in the images of so many views: cropped, of another size, or of another focal length."""
+    """Causes in the images of a number of views: cropped, of another size, or of another focal length."""
 
     def shifted(s: _Changed, theta: FloatArray, views: FloatArray) -> _Changed:
         return s._replace(shift=s.shift + views[:, None] * theta)
@@ -395,7 +398,7 @@ def _image_causes(count: int, centre: FloatArray | None) -> Iterator[_Cause]:
 
 
 def _camera_causes(count: int, twists: FloatArray) -> Iterator[_Cause]:
-    """Causes in where so many cameras stand, by rigid motions (d, 4, 4).
+    """Causes in the poses of some cameras, by rigid motions (d, 4, 4).
 
     Of one camera alone, motions of itself and of all cameras are the same.
     """
@@ -428,7 +431,7 @@ def _camera_causes(count: int, twists: FloatArray) -> Iterator[_Cause]:
 
 
 def _body_causes(evidence: Evidence, numbers: IntArray) -> Iterator[_Cause]:
-    """Causes in the markers, on the tool or in the scene: each, those of a tag, and all of them."""
+    """Causes in the markers, on the tool or in the scene: each, all of a tag, and all of them."""
     twists, d = evidence.twists, len(evidence.twists)
     visible: BoolArray = np.any(evidence.seen, axis=(0, 1))
     tags = [np.flatnonzero(numbers // CORNERS == t) for t in np.unique(numbers // CORNERS)]
@@ -477,7 +480,7 @@ def together(moved: list[Explanation]) -> Explanation:
 
 
 def contains(cause: _Cause, other: _Cause) -> bool:
-    """Whether a cause explains what another one does, with more parameters."""
+    """Whether a cause explains the same as another one, with more parameters."""
     alike = set(other.views) <= set(cause.views) if cause.views else cause.which in (ALL, other.which)
     alike |= set(other.markers) <= set(cause.markers) != set()
     more = cause.starts.shape[1] > other.starts.shape[1]

@@ -42,25 +42,26 @@ NAMED_AT = (5, 7, 10, 15, 25, 40, 60)
 _TWO_AT = 15
 # Advantage over the next cause, twice the logarithm of odds, at which one is named alone.
 _CLEAR = 2.0 * np.log(100.0)
-# Share of what images are off that a cause may leave.
+# Share of the image errors that a cause may leave.
 _LEFT = 0.15
-# Share of the pixels that images are off by which a cause changes them at least: backlash that is
+# Minimum share of the image errors, px, by which a cause changes images: backlash that is
 # more than the calibration found is no turn of a camera by the rest.
 _LEAST_PART = 0.2
-# A corner that is off by less, px, from one side of the tool may be an edge that the finder took for another;
-# one that a single camera watches may also be pulled by what covers its edge, by a few pixels.
+# A corner that errs by less, px, from one side of the tool may be an edge that the finder took for another;
+# one that a single camera watches may also be pulled by an object that covers its edge, by a few pixels.
 LEAST_MOVED_PX, _LEAST_MOVED_ALONE_PX = 1.0, 8.0
 # Share of the markers that a view saw shortly before: one that sees less is covered by something.
 _COVERED = 0.5
-# Share of the detections of a view that may not be off by themselves for long: then the view is.
+# Share of the detections of a view that may not err singly for long: then the view does.
 _MOST_FOR_LONG = 0.25
 # Share of a slip that the set-point of a joint went without its reading: then the reading is frozen.
 _UNANSWERED = 0.5
 # Observations in which a hand comes or goes.
 _COMES = 10
-# Views whose agreement is evidence beside one that is covered. Of fewer all are covered where one is.
+# Views whose agreement is evidence if one is covered. With fewer views, one covered view counts as all
+# covered.
 _SUFFICE = 2
-# Causes that are named beside each other, by several views and by one, which tells fewer apart.
+# Number of causes that are named together, by several views and by one, which separates fewer.
 _MOST_NAMED, _MOST_NAMED_BY_ONE = 2, 3
 # Observations that are remembered one by one.
 _REMEMBERED = 80
@@ -73,7 +74,7 @@ class _Kept(NamedTuple):
 
     pair: FramePair
     residual: Residual
-    aside: BoolArray  # (V, m) detections that are off by themselves
+    aside: BoolArray  # (V, m) inconsistent detections
     stated: FloatArray | None  # (V, m) deviations of the pixels, px, as the finder states them
     view: int  # number of the view that it is of
     views: int  # views that agreed up to it
@@ -112,7 +113,7 @@ class ImageMonitor:
     sigma_px : pixel noise per coordinate.
     max_observations : length of the longest sequence, which sets the thresholds.
     shown : indices of the markers that images may show, None all; of many, some stand for all.
-    image_size : (V, 2) px, of each image; None or infinite where it is not known.
+    image_size : (V, 2) px, of each image; None or infinite if it is not known.
     ``fault``: the fault in words; empty without one, or while its cause is not clear.
     ``observations``: number of those that showed a marker and were tested. ``agreeing``: number of those of
     one view in a row that agree. ``rejected``: (V, m) detections of the last observation that are off by
@@ -210,7 +211,7 @@ class ImageMonitor:
         return self.fault
 
     def mean_at_rest(self) -> Observation | None:
-        """Return the mean of the last observations of one posture, as one; None where there is none.
+        """Return the mean of the last observations of one posture, as one; None if there is none.
 
         It has the deviations of its frames, if the finder states them: errors of a finder that stay do not
         average away.
@@ -227,7 +228,7 @@ class ImageMonitor:
         return Observation.of_one(self.calibration.marker, q, images, self.calibration.view, stated)
 
     def undetected_mm(self, q: FloatArray, used: BoolArray, posture: Posture) -> float:
-        """Return how far off the face may be at joints (n,) by what no test tells from none, mm.
+        """Return the largest position error of the face at joints (n,) that the tests could miss, mm.
 
         used : (V, m) markers of the calibration by which a law measures it, all of them; posture : at q.
         """
@@ -239,7 +240,7 @@ class ImageMonitor:
         return self._detector.undetected(carry, self._errors.residual(pair), self._kept[-1].pair.sigma_t)
 
     def give_up(self) -> Finding | None:
-        """Return the fault that is pending, by the observations so far."""
+        """Return the fault that is pending, by the observations until now."""
         if self.pending and not self.fault:
             self.fault = self._finding(self._explanations(self._since_onset(), self._before))
         return self.fault
@@ -258,7 +259,7 @@ class ImageMonitor:
         tested = self._detector.tested(residual)
         hidden = self._covered(residual, tested.aside)
         covered = bool(hidden.any() and (residual.seen.any(axis=1) & ~hidden).sum() < _SUFFICE)
-        if hidden.any() and not covered:  # what is left of a covered view is no evidence: the others are
+        if hidden.any() and not covered:  # the rest of a covered view is no evidence: the others are
             residual = residual.without(residual.seen & hidden[:, None])
             tested = self._detector.tested(residual)
         self._asides = np.where(tested.aside, self._asides + 1, self._asides * ~residual.seen)
@@ -299,7 +300,7 @@ class ImageMonitor:
             self._judge_markers()
 
     def _disagree(self, since: Sums | None) -> None:
-        """Count an observation that disagrees, and name the fault where that can be done."""
+        """Count an observation that disagrees, and name the fault if that can be done."""
         if since is not None:  # the likeliest onset, as far as observations are remembered
             after = [tested for tested in self._kept if tested.views > since.views]
             self._onset, self._before = self.observations - max(1, len(after)), since
@@ -393,11 +394,11 @@ class ImageMonitor:
         fits = [self._frozen(fit) for fit in evidence.explanations(causes) if is_possible(fit)]
         if not fits:  # markers that the chosen observations do not show
             return fits
-        # Where even the best leaves more than chance does, the unit is what that leaves.
+        # Where even the best leaves more than chance does, its residual is the unit.
         minimum = min(fits, key=lambda fit: fit.left)
         self._unit = max(1.0, minimum.left / max(1.0, evidence.rows - minimum.theta.size))
         fits = [fit._replace(gain=fit.gain / self._unit, left=fit.left / self._unit) for fit in fits]
-        # Of causes without a parameter the unit is not known: corners err otherwise from the other side.
+        # For causes without a parameter the unit is not known: corners err otherwise from the other side.
         discrete = [not fit.theta.size and self._explains(fit) for fit in fits]
         fits = [
             self._by_any_unit(fit, minimum) if alone else fit
@@ -410,12 +411,12 @@ class ImageMonitor:
         return [together(moved), *(fit for fit in fits if fit.cause.kind != "marker")]
 
     def _by_any_unit(self, fit: Explanation, minimum: Explanation) -> Explanation:
-        """Return a cause with its odds against the fit that leaves the least, where both have their own unit.
+        """Return a cause with its odds against the best fit, if both have their own unit.
 
         Source: [MacKay 1992], with the unit integrated out.
         """
-        least = max(minimum.left / self._unit, 1e-9)  # of exact images rounding is left
-        more = self._evidence_now.rows * np.log(max(fit.left / least, 1.0))
+        min_left = max(minimum.left / self._unit, 1e-9)  # rounding remains for exact images
+        more = self._evidence_now.rows * np.log(max(fit.left / min_left, 1.0))
         return fit._replace(gain=max(fit.gain, float(minimum.gain / self._unit - more)))
 
     def _frozen(self, fit: Explanation) -> Explanation:
@@ -428,7 +429,7 @@ class ImageMonitor:
         return fit
 
     def _evidence(self, kept: list[_Kept], before: Sums) -> Evidence:
-        """Observations to be explained, those of one view with their common weight."""
+        """Observations to be explained, all of one view with their common weight."""
         memory = self._detector.memory
         views = np.array([tested.view for tested in kept])
         count = np.array([(views == view).sum() for view in views], dtype=np.float64)
@@ -446,7 +447,7 @@ class ImageMonitor:
     def _has_passed(self, kept: list[_Kept]) -> bool:
         """Whether the last observations agree, alone and together, and no cause explains them better.
 
-        Then windows show what was, blur or a hand: a fault stays.
+        Then windows show the past, blur or a hand: a fault stays.
         """
         if self._sound < WINDOW:
             return False
@@ -456,14 +457,14 @@ class ImageMonitor:
         return gained <= 0.0 and self._evidence_now.before <= self._by_chance(self._evidence_now)
 
     def _by_chance(self, evidence: Evidence) -> float:
-        """χ² of evidence that chance, lasting errors of corners and those of the model may leave."""
+        """χ² of evidence that chance, lasting errors of corners and errors of the model may leave."""
         rows, lasting = evidence.rows, 1.0 - self._detector.memory.fresh
         return float((1.0 + lasting) * rows + 3.0 * np.sqrt(2.0 * rows) + evidence.bias)
 
     def _is_edge(self, fit: Explanation, kept: list[_Kept]) -> bool:
-        """Whether what seems to have moved is perhaps an edge that a finder took for that of a marker.
+        """Whether a seeming motion may be an edge that a finder took for the edge of a marker.
 
-        An edge is off alike as long as the tag is seen from one side.
+        An edge errs alike as long as the tag is seen from one side.
         kept : observations that showed it.
         """
         if not fit.cause.markers:
@@ -476,9 +477,9 @@ class ImageMonitor:
         return self._errors.slants(np.array([tested.pair.q.mean(axis=0) for tested in kept])) < WINDOW
 
     def _judge_markers(self) -> None:
-        """Name markers that two views show off by themselves for long."""
+        """Name markers that two views show as inconsistent for long."""
         in_both, in_either = np.sort([np.zeros_like(self._asides[0]), *self._asides], axis=0)[-2:]
-        # What hides an edge shows in one view, and passes; one camera is believed after a hand has passed.
+        # A cover of an edge shows in one view, and passes; one camera is believed after a hand has passed.
         long = in_either >= (NAMED_AT[-1] if len(self._asides) == 1 else np.inf)
         due = (in_both == NAMED_AT[0]) | (in_either == _TWO_AT) | (long & (in_either == NAMED_AT[-1]))
         if self.pending or not due.any():
@@ -503,12 +504,13 @@ class ImageMonitor:
         """Return the fault with the likeliest of causes."""
         pair, residual = self._kept[-1][:2]
         explained, numbers = self._explains(fits[0]), self.calibration.marker
-        # What moves all images may show a tag where another one was.
+        # A motion of all images may show a tag where another one was.
         by_itself = not explained or fits[0].cause.row.part == MARKERS
         if by_itself and (misplaced := misplaced_tags(pair.images, residual.predicted, numbers)):
             return Finding("misplaced_tags", REFUSES, others=misplaced)
         square = np.square(residual.r).reshape(len(residual.seen), -1).sum(axis=1)
-        rms = np.sqrt(square / np.maximum(residual.seen.sum(axis=1), 1)).max()  # of the view that is most off
+        # for the view with the largest errors
+        rms = np.sqrt(square / np.maximum(residual.seen.sum(axis=1), 1)).max()
         if not explained:
             off, where = float(rms), self._where(residual)
             return Finding("unexplained_images", REFUSES, where, off, unit="px")
@@ -518,8 +520,8 @@ class ImageMonitor:
         said = [fits[0], *(fit for fit in simpler if fit.left <= maximum), *_rivals(fits)[1:]]
         if len({tested.view for tested in self._since_onset()}) == 1:
             said += _as_rigid(fits)
-        most = _MOST_NAMED_BY_ONE if len(residual.seen) == 1 else _MOST_NAMED
-        causes = tuple(finding_of(fit, self.calibration) for fit in said[:most])
+        max_named = _MOST_NAMED_BY_ONE if len(residual.seen) == 1 else _MOST_NAMED
+        causes = tuple(finding_of(fit, self.calibration) for fit in said[:max_named])
         return Finding("images_off", REFUSES, amount=float(rms), unit="px", others=causes)
 
     def _where(self, residual: Residual) -> Subject:
@@ -530,7 +532,7 @@ class ImageMonitor:
 
 
 def _rivals(fits: list[Explanation]) -> list[Explanation]:
-    """The likeliest cause and those of other names that are nearly as likely."""
+    """The likeliest cause and causes of other names that are nearly as likely."""
     rivals: list[Explanation] = []
     for fit in fits:
         near = fits[0].score - fit.score < _CLEAR and not contains(fit.cause, fits[0].cause)

@@ -41,11 +41,11 @@ _IN_MOTION, _AT_REST, _BETWEEN_VIEWS = range(3)
 # A corner errs as detections of the calibration from within about this angle, rad; this number of typical
 # ones counts with them.
 _SLANT, _PRIOR_SIGHTINGS = 0.25, 4.0
-# In a view that the calibration has not seen all of them are, by so many.
+# In a view that the calibration has not seen all of them are, by this number.
 _UNUSUAL = 1.0
-# Joints (rad or m) and instants (s) are known no better than this, whatever is stated.
+# Joints (rad or m) and instants (s) are known no better than this, also if stated.
 LEAST_ERROR = 1e-6
-# A direction counts where it keeps this share of its size after the others; ridge for solving.
+# A direction counts if it keeps this share of its size after the others; ridge for solving.
 _RANK, _RIDGE = 1e-6, 1e-9
 # Frames that are so near show joints of one reading, s.
 _AT_ONCE_S = 1e-4
@@ -56,7 +56,7 @@ _AT_REST_PX, _ENOUGH = 0.2, 100.0
 # Differences between this number of frames at rest show how a detection trembles: the median of χ² with two
 # degrees of freedom, which is beyond the second number once in ten thousand.
 _DIFFERENCES, _MEDIAN, _MEDIAN_AT_MOST = 9, 1.386, 5.6
-# χ² of a detection that may be off by itself: once in ten thousand by chance.
+# χ² of a detection that may be a single outlier: once in ten thousand by chance.
 _OFF_ALONE = 18.4
 # Minimum information on a direction, in units of its deviations: one that no image shows has some.
 _LEAST_INFORMATION = 1e-12
@@ -64,7 +64,7 @@ _LEAST_INFORMATION = 1e-12
 _NEARLY_WHOLE = 2.0 / 3.0
 # Deviations from which a difference is distinguished from none.
 DISTINCT = 2.0
-# Share of the markers of a view that may be off one by one before the view itself is.
+# Share of the markers of a view that may be single outliers before the view itself is one.
 _MOST_ASIDE = 0.5
 
 
@@ -76,7 +76,7 @@ class Residual(NamedTuple):
     predicted: FloatArray  # (V, m, 2) px
     r: FloatArray  # (2 V m,) seen less predicted, px
     B: FloatArray  # (2 V m, e) derivatives by the errors of the calibration, in units of their deviations
-    F: FloatArray  # (2 V m, f) derivatives by what may be wrong
+    F: FloatArray  # (2 V m, f) derivatives by possible errors
     R: FloatArray  # (2 V m, 2 V m) covariance of one observation but for the errors of the calibration, px²
 
     def without(self, aside: BoolArray) -> "Residual":
@@ -87,12 +87,12 @@ class Residual(NamedTuple):
 
 
 class Sums(NamedTuple):
-    """Normal equations of observations, those of one view with their common weight."""
+    """Normal equations of observations, all of one view with their common weight."""
 
     views: int  # views that they come from
     t: float  # when the last was taken, s from the first observation
-    normal: FloatArray  # (c, c) of errors of the calibration, of what may be wrong, and of the residual
-    by_corner: FloatArray  # (c - 1, 2 V m) its last column by coordinates that all show off by one deviation
+    normal: FloatArray  # (c, c) of errors of the calibration, of possible errors, and of the residual
+    by_corner: FloatArray  # (c - 1, 2 V m) its last column by coordinates that all err by one deviation
     weight: float  # single observations that they are worth
     weight_squares: float  # Σ of its square over views
     seen: FloatArray  # (V, m) coordinates seen of each marker
@@ -143,7 +143,7 @@ class ErrorModel:
         self.twists = rigid_motions(calibration.H_hat_0, self.directions, calibration.a_inf)
         self.cameras = [np.linalg.svd(P.reshape(1, CAMERA))[2][1:].T for P in calibration.P]
         self.parts, self.touches, self.f = _directions_of(V, n, m, len(self.twists))
-        self.fixed = 2 * n + V  # columns of joints, their drift and instants, before those of cameras
+        self.fixed = 2 * n + V  # columns of joints, their drift and instants, before the columns of cameras
         self.tool = slice(self.f - 2 * len(self.twists), self.f - len(self.twists))  # columns of its motions
         # Squares (K, V, m) by which corners erred while it was recorded, and where they were seen from.
         self._squares = calibration.corner_squares
@@ -161,11 +161,11 @@ class ErrorModel:
         return np.where(stated > 0.0, np.maximum(self._stated * stated, self._least), common)
 
     def raised(self, stated: FloatArray) -> FloatArray:
-        """Return deviations (V, m) as stated, px, raised to those that hold where none are stated."""
+        """Return deviations (V, m) as stated, px, raised to those that hold if none are stated."""
         return np.fmax(stated, self._common(stated.shape) / self._stated)
 
     def _common(self, shape: tuple[int, ...]) -> FloatArray:
-        """Deviations (V, m) of pixels that hold where none are stated, px."""
+        """Deviations (V, m) of pixels that hold if none are stated, px."""
         return np.broadcast_to(np.maximum(self._sigma * self._of_views, self._least), shape)
 
     def residual(self, pair: FramePair) -> Residual:
@@ -226,7 +226,7 @@ class ErrorModel:
         return len(sides)
 
     def _fault_derivative(self, at: Images, pair: FramePair) -> FloatArray:
-        """Derivatives (V, m, 2, f) of pixels by what may be wrong, in the order of ``_directions_of``."""
+        """Derivatives (V, m, 2, f) of pixels by possible errors, in the order of ``_directions_of``."""
         (V, n), m, d = pair.q.shape, len(self.scene.M), len(self.twists)
         F = np.zeros((V, m, 2, self.f))
         J_q = at.by_joint(self.scene.H_hat).reshape(V, m, 2, n)
@@ -290,7 +290,7 @@ class ErrorModel:
     def persistent_prior(self, seconds: float, sigma_t: FloatArray) -> FloatArray:
         """Information (2 n + V, 2 n + V) on errors of joints, their drift with time, and of instants.
 
-        Over that time joints are off by a straight line, its middle and its slope by what lasts.
+        Over that time joints err by a straight line, its middle and its slope by lasting errors.
         """
         n = len(self.sigma_q)
         weight = np.diag((_LASTING * np.concatenate([self.sigma_q, self.sigma_q, sigma_t])) ** -2.0)
@@ -323,13 +323,14 @@ class _Memory:
         self._total: Sums | None = None  # as last asked for
         # The last observation, as ``learn`` is given it.
         self._before: tuple[Residual, BoolArray, bool] | None = None
-        # Of differences from observation to observation, over σ²: in motion, at rest, and between views.
+        # Variance of differences from observation to observation, over σ²: in motion, at rest, and between
+        # views.
         self._squares, self._freedom = np.zeros(3), np.zeros(3)
-        # Of each detection (V, m) from one observation at rest to the next, px².
+        # Square of each detection (V, m) from one observation at rest to the next, px².
         self._steps: deque[FloatArray] = deque(maxlen=_DIFFERENCES)
 
     def noise(self, stated: FloatArray) -> FloatArray:
-        """Standard deviations (V, m) of pixels, px: those stated, or as they tremble where that is more.
+        """Standard deviations (V, m) of pixels, px: those stated, or as they tremble if that is more.
 
         The median of differences at rest gives it: a step, such as a fault makes, does not move it.
         """
@@ -387,7 +388,7 @@ class _Memory:
         """Add an observation; of earlier views those stay that date an onset to a quarter of its age.
 
         whole : whether no detection of it is aside. The rest is perhaps of the same hand or blur, and does
-        not agree where the calibration would have to be off beyond chance.
+        not agree where the calibration would have to err beyond chance.
         """
         new = self._errors.sums(residual, t)
         if not whole and self._errors.contradicts(self.total.plus(new)):
@@ -403,7 +404,7 @@ class _Memory:
         """Learn the fresh error of each frame from two in a row, free of errors of joints and instants.
 
         Those at rest give it, once there are enough: a corner that moves by part of a pixel errs otherwise.
-        aside : (V, m) detections that are off by themselves, of which only the trembling counts.
+        aside : (V, m) single outliers, of which only the trembling counts.
         disagrees : whether this observation does; a pair of which one does is skipped.
         """
         last, self._before = self._before, (now, aside, disagrees)
@@ -416,11 +417,11 @@ class _Memory:
         in_both = before.seen & now.seen
         rows = np.repeat((in_both & ~aside & ~last[1]).ravel(), 2)
         weight = 1.0 / np.repeat(now.noise.ravel(), 2)[:, None]
-        columns = np.r_[:n, 2 * n : self._errors.fixed]  # of joints and instants
+        columns = np.r_[:n, 2 * n : self._errors.fixed]  # columns of joints and instants
         off, moved = (now.r - before.r) * weight[:, 0], now.F[:, columns] * weight
         if kind == _BETWEEN_VIEWS:
             moved = np.concatenate([moved, before.F[:, columns] * weight], axis=1)
-        # All instants together are a motion of the joints: what depends on others is no direction of its own.
+        # All instants together are a motion of the joints: dependent ones are no separate direction.
         basis, sizes, turned = np.linalg.svd(moved[rows], full_matrices=False)
         independent = sizes > _DEPENDENT * sizes.max(initial=0.0)
         basis, back = basis[:, independent], turned[independent].T / sizes[independent]
@@ -463,7 +464,7 @@ def _kind_of(before: FloatArray, now: FloatArray) -> int:
 
 
 def _alike(before: FloatArray, now: FloatArray, within_px: float) -> bool:
-    """Whether predicted pixels (V, m, 2) are the same within so many px rms."""
+    """Whether predicted pixels (V, m, 2) are the same within a number of px rms."""
     moved = np.square(now - before).sum(axis=-1)
     return bool(np.nanmean(np.append(moved, 0.0)) <= within_px**2)
 
@@ -471,12 +472,12 @@ def _alike(before: FloatArray, now: FloatArray, within_px: float) -> bool:
 class _Reduced(NamedTuple):
     """Normal equations of faults since an onset without nuisance errors: a Schur complement."""
 
-    normal: FloatArray  # (f + 1, f + 1) of what may be wrong, and of the residual
+    normal: FloatArray  # (f + 1, f + 1) of possible errors, and of the residual
     minimum: FloatArray  # (f + 1,) its diagonal at least
     root: FloatArray  # (e, e) of the information on errors of the calibration
-    along: FloatArray  # (e, f) what may be wrong along these
+    along: FloatArray  # (e, f) possible errors along these
     nuisance: IntArray  # (k,) columns of lasting errors of joints and instants
-    solved: FloatArray  # (k, f) and what may be wrong along those
+    solved: FloatArray  # (k, f) and possible errors along those
     line: FloatArray  # (f, f) to time from the onset
 
     def of(self, rows: FloatArray) -> FloatArray:
@@ -491,7 +492,7 @@ class Tested(NamedTuple):
     """Tests of one observation."""
 
     disagrees: bool  # whether the whole of it does
-    aside: BoolArray  # (V, m) detections that are off by themselves
+    aside: BoolArray  # (V, m) single outliers
 
 
 class Detector:
@@ -518,16 +519,16 @@ class Detector:
             (which, np.array([errors.parts[i] for i in which]))
             for which in (np.flatnonzero(self._sizes == size) for size in np.unique(self._sizes))
         ]
-        # Excess of each direction at the last test, and what of it was accepted as no fault.
+        # Excess of each direction at the last test, and its part that was accepted as no fault.
         self._last = np.full(len(self._sizes), -np.inf)
         self._accepted = np.zeros(len(self._sizes))
 
     def accept(self) -> None:
-        """Accept what windows show beyond chance now as no fault: only more of it counts from here on."""
+        """Accept the present excess of windows as no fault: only more of it counts from here on."""
         self._accepted = np.maximum(self._accepted, self._last)
 
     def tested(self, residual: Residual) -> Tested:
-        """Test χ² of each view and each marker in one observation, without detections off by themselves."""
+        """Test χ² of each view and each marker in one observation, without single outliers."""
         errors, (V, m) = self._errors, residual.seen.shape
         total = self.memory.total
         columns = np.concatenate([residual.B.T, total.normal[: errors.e, -1:]], axis=1)
@@ -576,8 +577,8 @@ class Detector:
     ) -> Sums | None:
         """Sums before the likeliest onset of residuals beyond chance, if there is one.
 
-        count : of observations so far; sigma_t : (V,) deviation of instants, s; free : columns of markers
-        that are known to be off; thorough : test windows of all lengths, not of another one each time.
+        count : of past observations; sigma_t : (V,) deviation of instants, s; free : columns of markers
+        that are known to be wrong; thorough : test windows of all lengths, not of another one each time.
         """
         total, onsets = self.memory.total, self.memory.onsets()
         if not onsets or not total.views:
@@ -592,9 +593,9 @@ class Detector:
             since = min(onsets, key=lambda sums: abs(total.views - length - sums.views))
             excess = self._excess(since, total, self._reduced(since, total, sigma_t, free), by_chance)
             self._last = np.maximum(self._last, excess)
-            most = float((excess - self._accepted).max())
-            if most > maximum:
-                likeliest, maximum = since, most
+            max_excess = float((excess - self._accepted).max())
+            if max_excess > maximum:
+                likeliest, maximum = since, max_excess
         return likeliest
 
     def _reduced(self, since: Sums, total: Sums, sigma_t: FloatArray, free: list[IntArray]) -> _Reduced:
@@ -627,7 +628,7 @@ class Detector:
         )
 
     def _excess(self, since: Sums, total: Sums, reduced: _Reduced, by_chance: FloatArray) -> FloatArray:
-        """Root of what each direction gains (h,) beyond chance, errors of the model and of corners.
+        """Root of the gain of each direction (h,) beyond chance, errors of the model and of corners.
 
         Corners err at their worst in each view; or they do so in one, as independent from view to view, and
         those that last beyond a view add to the covariance of a direction. The bound that allows less holds.
@@ -655,7 +656,7 @@ class Detector:
     def _spread(self, since: Sums, total: Sums, reduced: _Reduced) -> FloatArray:
         """Covariance (f, f) of scores by corners that each keep an error of one deviation.
 
-        Those that are off all along change the calibration as seen before the onset, too.
+        Markers that err all along change the calibration as seen before the onset, too.
         """
         e, by_corner = self._errors.e, total.by_corner - since.by_corner
         by_corner[:e] = total.by_corner[:e]
@@ -663,13 +664,13 @@ class Detector:
         return np.asarray(off @ off.T)
 
     def undetected(self, carry: FloatArray, at: Residual, sigma_t: FloatArray) -> float:
-        """Return how far off a measurement may be by what no test tells from none.
+        """Return the largest error of a measurement that the tests could miss.
 
-        Of each direction of a fault but those of joints and instants: what observations show of it since the
+        For each direction of a fault except joints and instants: the evidence in observations since the
         first, of a camera also since two thirds of them, since it may drift, and two deviations of that. The
         largest is returned: a fault has one cause.
 
-        carry : (k, 2 V m) from changes of pixels to what is measured; at : images where it is measured.
+        carry : (k, 2 V m) from changes of pixels to the measured quantity; at : images at the measurement.
         Source: W. Baarda, "A testing procedure for use in geodetic networks", Delft 1968, on external
         reliability.
         """
@@ -680,9 +681,9 @@ class Detector:
         cameras = fixed + len(total.seen) * (CAMERA - 1)
         for since, end in ((onsets[0], self._errors.f), (late, cameras)):
             reduced = self._reduced(since, total, sigma_t, [])
-            lasting = max(0.0, 1.0 - _one_of(since, total)) * self.memory.persistent
-            lasting += (total.bias - since.bias).sum() / (total.seen - since.seen).sum()
-            spread = reduced.normal[:-1, :-1] + lasting * self._spread(since, total, reduced)
+            persistent_share = max(0.0, 1.0 - _one_of(since, total)) * self.memory.persistent
+            persistent_share += (total.bias - since.bias).sum() / (total.seen - since.seen).sum()
+            spread = reduced.normal[:-1, :-1] + persistent_share * self._spread(since, total, reduced)
             for part in self._errors.parts:
                 if not fixed <= part[0] < end:
                     continue
@@ -696,7 +697,7 @@ class Detector:
         return float(np.sqrt(greatest))
 
     def _root_gains(self, reduced: _Reduced, more: FloatArray | float) -> FloatArray:
-        """Root (h,) of what each direction gains, its score with more covariance (f, f)."""
+        """Root (h,) of the gain of each direction, its score with more covariance (f, f)."""
         normal, gain = reduced.normal, np.zeros(len(self._sizes))
         covariance = normal[:-1, :-1] + more
         for which, columns in self._by_size:
@@ -721,13 +722,13 @@ def _one_of(since: Sums, total: Sums) -> float:
 
 
 def _greatest(spread: FloatArray, reduced: _Reduced, part: IntArray) -> float:
-    """Greatest ratio of a covariance (f, f) to that of the score of a direction."""
+    """Greatest ratio of a covariance (f, f) to the covariance of the score of a direction."""
     own, other = reduced.normal[np.ix_(part, part)], spread[np.ix_(part, part)]
     size = np.sqrt(np.maximum(own.diagonal(), np.maximum(reduced.minimum[part], 1e-300)))
     unit = np.outer(size, size)
     try:
         return float(eigh(other / unit, own / unit + _RANK * np.eye(len(part)), eigvals_only=True)[-1])
-    except np.linalg.LinAlgError:  # of images so far off that rounding is left of a direction
+    except np.linalg.LinAlgError:  # with large image errors, rounding remains of a direction
         return np.inf
 
 
@@ -746,7 +747,7 @@ def farthest_alone(S: FloatArray, r: FloatArray, detections: IntArray, limit: fl
 
 
 def relative_noise(calibration: Calibration) -> FloatArray:
-    """Noise (V, 1) of each view over that of the calibration."""
+    """Noise (V, 1) of each view over the noise of the calibration."""
     common, own = max(calibration.sigma_px, MIN_SIGMA), calibration.sigma_view_px
     return np.ones((len(calibration.P), 1)) if own is None else own[:, None] / common
 

@@ -37,7 +37,7 @@ _DAMPED = 1e6
 _NEAR, _SETTLED = 1e-3, 1e-7
 # Longest Newton step of a joint, rad or m.
 _STRIDE = 0.7
-# Noise that is allowed for where none is known, px.
+# Noise that is allowed for if none is known, px.
 _LEAST_SIGMA = 0.2
 # Maximum residual of a solution, px, as a multiple of the minimum.
 _MUCH = 2.0
@@ -125,7 +125,7 @@ def _normal_equations_into(
 def _image_row_into(
     P: FloatArray, s_star: FloatArray, k: int, moving: tuple[Vec4, Vec4], J: FloatArray, off: FloatArray
 ) -> None:
-    """Write the velocities (2 V,) of the images of a point at a velocity, and how far they are off, px.
+    """Write the velocities (2 V,) of the images of a point at a velocity, and their errors, px.
 
     s_star : (V, m, 2) images that are aimed at; both are zero where marker k is not among them.
     """
@@ -200,7 +200,7 @@ def _settled(
 
 @merged
 def _apart_into(P: FloatArray, A: Vec4, P_j: FloatArray, A_j: Vec4, off: FloatArray) -> None:
-    """Write how far the images (2 V,) of a point by other cameras are from those of another point, px."""
+    """Write the differences (2 V,), px, of a point's images by other cameras from another point's."""
     for view in range(P.shape[0]):
         s, s_j = straight_pixel(P[view], A), straight_pixel(P_j[view], A_j)
         off[2 * view], off[2 * view + 1] = s_j[0] - s[0], s_j[1] - s[1]
@@ -212,7 +212,7 @@ def _explained(
 ) -> float:
     """Return the sum of squared residuals, px², that noise and calibration explain at a goal configuration.
 
-    Of each way in which the calibration may be off, what no motion of the joints makes up for. The motion
+    For each error of the calibration, the part that no motion of the joints compensates. The motion
     that makes up for the rest, and for noise, is the error of the joints: its standard deviation (n,), rad
     or m, is written; ``_REDUNDANT`` of an arm of more joints than six, which can move them at will.
     """
@@ -306,7 +306,7 @@ def _where(c: Constraints, q: FloatArray, trial: Trial) -> int:
     for j in range(column(FRONT, V), column(IMAGE, V)):
         if not trial.margins[j] > 0.0:
             return _HIDDEN
-    # A goal was chosen, and is seen on arrival: what its prediction may be off speaks for it.
+    # A goal was chosen, and is seen on arrival: the error of its prediction speaks for it.
     H = forward(c.model, q)
     doubt = min(DEVIATIONS * max_error(c, q, H, trial), FINE_PX)
     return _SHOWN if clear_by(c, H, trial.s) > -doubt else _BLOCKED
@@ -335,7 +335,7 @@ def _rank(
 ) -> FloatArray:
     """Time from the start (t,), s, to turns (t, n) of a solution of such deviations (n,).
 
-    ``UNSURE`` and more where it may be near a singularity, or beyond a limit if it is not certain: the less
+    ``UNSURE`` and more if it may be near a singularity, or beyond a limit if it is not certain: the less
     within in standard deviations, the more.
     """
     sure = np.full(len(q), min(1.0, _DEFINITE / deviation.max()))

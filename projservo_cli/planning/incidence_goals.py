@@ -1,4 +1,4 @@
-"""Goals of a list of incidences: joints at which all hold, of a continuum where they leave freedoms.
+"""Goals of a list of incidences: joints at which all hold, of a continuum if they leave freedoms.
 
 Newton's method leads from many joints to the nearest ones at which the incidences hold. Of these, goals in
 sight and within limits come first, and among them the near ones with margins.
@@ -18,7 +18,7 @@ from projservo_cli.task.incidences import Incidences, image_error_at, linearized
 _AROUND, _ANYWHERE, _SPREAD = 24, 24, 0.5
 # Newton steps, the longest of a joint, rad or m, and the image error, px, at which they hold exactly.
 _STEPS, _STRIDE, _MET_PX = 40, 0.4, 1e-6
-# Error over the least, up to which goals that are not exact are met as well.
+# Error over the minimum, up to which goals that are not exact are met as well.
 _AS_WELL = 1.01
 # Margin over that asked for, from which more of it counts no more.
 _AMPLE = 10.0
@@ -35,8 +35,8 @@ def _share(c: Constraints, q: FloatArray) -> float:
     share = float((margins_at(c, q)[0][: len(asked)] / asked).min())
     H = forward_kinematics(c.model, q)
     J = image_jacobian(c.model.P, c.M @ H.T, joint_operators(c.model, q)).reshape(-1, len(q))
-    told = np.linalg.svd(J * c.keep / 3.0, compute_uv=False)
-    return min(share, float(told[min(len(q), COORDINATES) - 1]))
+    singular_values = np.linalg.svd(J * c.keep / 3.0, compute_uv=False)
+    return min(share, float(singular_values[min(len(q), COORDINATES) - 1]))
 
 
 def _joints_meeting(
@@ -60,12 +60,12 @@ def goals_meeting(
     q_start: FloatArray,
     taught: FloatArray,
     seed: int,
-    most_px: float,
+    max_px: float,
 ) -> tuple[FloatArray, FloatArray]:
     """Return joints (g, n) at which all incidences hold, the best first, and those that come nearest (n,).
 
     The best are in sight, then soon reached with margins. Goals that show less come after the others. Where
-    none is exact, as with fewer joints than rows, the nearest ones hold that leave no more than ``most_px``.
+    none is exact, as with fewer joints than rows, the nearest ones hold that leave no more than ``max_px``.
 
     taught : (l, n) joints where the goal was taught; seed : of the starts.
     """
@@ -78,7 +78,7 @@ def goals_meeting(
     ends = np.array([_joints_meeting(c.model, incidences, start, low, high) for start in np.vstack(starts)])
     left = np.array([image_error_at(incidences, forward_kinematics(c.model, q)) for q in ends])
     nearest = ends[int(np.argmin(left))]
-    within = max(_MET_PX, _AS_WELL * float(left.min())) if left.min() <= most_px else _MET_PX
+    within = max(_MET_PX, _AS_WELL * float(left.min())) if left.min() <= max_px else _MET_PX
     found: list[FloatArray] = []
     rank: list[tuple[bool, float]] = []
     for q in ends[left <= within]:

@@ -1,9 +1,9 @@
 """Constraints as signed numbers: joint limits, visibility, image borders, from the calibrated model alone.
 
-The margins are those of ``planning.motion_margins``. Of a tool with several tags visibility, width and image
-are those of the tag that keeps them best.
+The margins are defined in ``planning.motion_margins``. For a tool with several tags, visibility,
+width and image come from the tag that keeps them best.
 
-Joints are valid if each margin is above the required one, which is at most a fraction of those of start
+Joints are valid if each margin is above the required one, which is at most a fraction of the margins of start
 and goal have themselves, rising to its full value within ``_RISE`` of them.
 """
 
@@ -49,7 +49,7 @@ _RISE = 0.5
 # Between two checks no marker moves more than this in an image, px, and no joint more than that, rad or m.
 FINE_PX = 4.0
 _FINE_STEP = 0.2
-# So many standard deviations a prediction may be off.
+# Standard deviations by which a prediction may err.
 DEVIATIONS = 3.0
 # Maximum error of a marker of the body, over the maximum error of the face.
 _FAR_OFF = 5.0
@@ -61,15 +61,15 @@ class Constraints(NamedTuple):
     """Constraints of joints, in the frame of the calibrated model."""
 
     model: Model  # its cameras scaled so that markers in front have a positive third coordinate
-    M: FloatArray  # (b, 4) markers of the body at the reference, those of the face first
+    M: FloatArray  # (b, 4) markers of the body at the reference, the face first
     face: int  # how many are of the face
     tags: IntArray  # (t, k) markers of the face, or of tags, of which one is to be in sight
     a: FloatArray  # (t, 4) their planes at the reference
-    O: FloatArray  # (V, 4) optical centres, a·O = 1 of the face at the start where they are before it
+    O: FloatArray  # (V, 4) optical centres, a·O = 1 of the face at the start if they are before it
     depth: FloatArray  # (V,) minimum third coordinate of a marker at the start
-    limits: JointLimits  # of the joints
-    image_size: FloatArray  # (V, 2) px, of each; infinite where an image has no border
-    least_views: int  # number of views that are to see the face, the best ones
+    limits: JointLimits  # limits of the joints
+    image_size: FloatArray  # (V, 2) px, of each; infinite if an image has no border
+    min_views: int  # number of views that are to see the face, the best ones
     keep: FloatArray  # (n,) distance from a limit that counts as margin one, rad or m
     full: FloatArray  # (c,) margins asked for, in the columns of ``planning.motion_margins``
     ends: FloatArray  # (k, n) start and goals, near which constraints are relaxed
@@ -108,7 +108,7 @@ def constraints_of(
         depth=(A @ model.P[:, 2].T).min(axis=0),
         limits=demands.limits,
         image_size=demands.image_size,
-        least_views=demands.least_views or V,
+        min_views=demands.min_views or V,
         keep=np.maximum(demands.keep, 1e-9),
         full=full,
         ends=np.zeros((0, n)),
@@ -147,7 +147,7 @@ def _images_into(c: Constraints, H: Mat4, s: FloatArray, margins: FloatArray) ->
         else:
             for k in range(c.M.shape[0]):
                 s[view, k, 0] = s[view, k, 1] = math.nan
-    return before >= c.least_views
+    return before >= c.min_views
 
 
 @internal
@@ -180,10 +180,10 @@ def _sight_into(
     """
     V = c.O.shape[0]
     for view in range(V):
-        shown = visible and math.isfinite(s[view, 0, 0])
+        seen_whole = visible and math.isfinite(s[view, 0, 0])
         sight[view] = dot(vec(c.a[tag]), apply(back, vec(c.O[view])))
-        sight[V + view] = width(s[view], c.tags[tag]) if shown else -math.inf
-        sight[2 * V + view] = math.inf if shown else -math.inf
+        sight[V + view] = width(s[view], c.tags[tag]) if seen_whole else -math.inf
+        sight[2 * V + view] = math.inf if seen_whole else -math.inf
         for k in c.tags[tag]:
             border = from_border(c.image_size[view], s[view, k, 0], s[view, k, 1])
             sight[2 * V + view] = min(sight[2 * V + view], border)
@@ -224,7 +224,7 @@ def _best_sight_into(c: Constraints, q: FloatArray, visible: bool, trial: "Trial
         for view in range(V):
             trial.excess[view] = _excess(c, view, trial)
         for view in range(V):
-            if _rank(trial, view) < c.least_views:
+            if _rank(trial, view) < c.min_views:
                 minimum = min(minimum, trial.excess[view])
             else:
                 for kind in range(3):
@@ -239,7 +239,7 @@ def _best_sight_into(c: Constraints, q: FloatArray, visible: bool, trial: "Trial
 
 @merged
 def twin_of(c: Constraints, j: int) -> Model:
-    """The calibrated model, off by the deviation j."""
+    """The calibrated model, changed by the deviation j."""
     m = c.model
     return Model(
         P=c.spread.P[j],
@@ -365,7 +365,7 @@ def margins_into(c: Constraints, q: FloatArray, trial: "Trial") -> None:
     _best_sight_into(c, q, visible, trial)
     margins[clear] = clear_by(c, H, s) if visible else -math.inf
     # Error of a prediction: its maximum or, if that could decide, its value there.
-    maximum, room = c.spread.most, math.inf
+    maximum, room = c.spread.max_sigma, math.inf
     anywhere = _FAR_OFF * maximum
     for view in range(V):
         trial.error[view] = maximum
@@ -433,7 +433,7 @@ class Trial(NamedTuple):
     margins: FloatArray
     demands: FloatArray  # margins, demands: (c,)
     sight: FloatArray  # (3 V,) side, width and border of one tag
-    excess: FloatArray  # (V,) least excess of these in each view
+    excess: FloatArray  # (V,) minimum excess of these in each view
     error: FloatArray  # (V,) error of a prediction in each image, px
     worst: FloatArray  # (V,) squared error, px², along one direction
     s: FloatArray

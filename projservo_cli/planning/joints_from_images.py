@@ -9,7 +9,7 @@ from scipy.optimize import least_squares
 from projservo_cli.calibration.prediction import predict
 from projservo_cli.records import Calibration, FloatArray
 
-# Starts from which joints are sought; how near they must come, and how far off points behind cameras are, px.
+# Starts from which joints are sought; how near they must come, and the error of points behind cameras, px.
 _TRIALS, NEAR_PX, _FAR_PX = 60, 1.0, 1e3
 
 
@@ -22,7 +22,7 @@ def joints_showing(
 ) -> tuple[FloatArray, float]:
     """Joints (n,) at which markers are predicted where images (V, b, 2) show them, and the median error, px.
 
-    Least squares from joints (n,) and from others about them, until a start leads near enough; else the
+    Least squares from joints (n,) and from others about them, until a start leads near enough; otherwise the
     nearest. s : NaN where unseen.
     """
     places, seen, rng = calibration.indices_of(numbers), np.isfinite(s), np.random.default_rng(0)

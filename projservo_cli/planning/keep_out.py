@@ -1,6 +1,6 @@
-"""Regions of the images that the body keeps out of: polygons that somebody drew around an obstacle.
+"""Regions of the images that the body keeps out of: polygons that the user drew around an obstacle.
 
-A point in space lies in front of, behind or in an obstacle where all cameras show it within the outline;
+A point in space lies in front of, behind or in an obstacle if all cameras show it within the outline;
 if one camera sees it outside the outline, it is outside the obstacle. This needs no metric.
 """
 
@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from projservo_cli.geometry.jit import internal, merged
 from projservo_cli.records import FloatArray, IntArray
 
-SEVERAL = -1  # in place of the only image in which a region is drawn
+SEVERAL = -1  # replaces the view if several images have a region
 _Pixel = tuple[float, float]
 
 
@@ -101,7 +101,7 @@ def draws(keep: KeepOut, region: int, view: int) -> bool:
 
 @merged
 def clearance(keep: KeepOut, region: int, view: int, s: _Pixel) -> float:
-    """Distance of a pixel of one image from the polygon of a region, px; infinite where none is drawn."""
+    """Distance of a pixel of one image from the polygon of a region, px; infinite if none is drawn."""
     for p in range(keep.image.shape[0]):
         if keep.region[p] == region and keep.image[p] == view:
             return outside_polygon(keep.corners, keep.first[p], keep.first[p + 1], s)

@@ -1,16 +1,16 @@
 """Constraints of a planned motion, by name and in words, and the margins of a motion along shares or joints.
 
-Each margin is a number, positive where its constraint holds. Of joints (n,), as
+Each margin is a number, positive if its constraint holds. Of joints (n,), as
 ``planning.joint_constraints`` writes them, less the error of a prediction:
 
 - joints: the minimum distance of a joint from its limits over the required margin;
 - front: the minimum third coordinate of P·M of a marker over that at the start: [RH00] section 4.2 carries
-  the sign, which nothing else fixes in projective space;
+  the sign, which is otherwise open in projective space;
 - visibility: a·O of the face and a camera over its value at the start, carried by the dual motion H⁻ᵀ;
 - width: the minimum width of the image of the face, px, for an angle means nothing in projective space;
 - image: the minimum distance of a marker of the face from the border of an image, px;
 - clear: the minimum distance from a keep-out region, px: of all markers, and of all points between
-  those of the face.
+  the markers of the face.
 
 Of a motion of the face, the worst of the views that are to see it counts, and
 
@@ -21,7 +21,7 @@ Of a motion of the face, the worst of the views that are to see it counts, and
 
 No path betters the margins of its ends. A planner therefore counts in shares of them, one scale a
 constraint: the smallest ratio is 1 if no sample is nearer than the worse of both
-ends, and 0 where a constraint is about to fail.
+ends, and 0 if a constraint is about to fail.
 """
 
 import math
@@ -54,14 +54,14 @@ from projservo_cli.image_size import BEHIND, border_distance
 from projservo_cli.records import VIEWS, FloatArray, IntArray, JointLimits, Model
 from projservo_cli.task.trajectory import displaced
 
-# Kinds of constraints. Margins of joints have a column of each, and one a view where each camera has its own;
+# Kinds of constraints. Margins of joints have a column of each, and one per view if each camera has its own;
 # the last one is of a motion between them alone.
 JOINTS, FRONT, VISIBILITY, WIDTH, IMAGE, CLEAR, CONDITIONING = range(7)
 
 
 @inline
 def column(kind: int, views: int) -> int:
-    """First column of a kind in margins of joints before so many views; of ``CONDITIONING`` their number."""
+    """First column of a kind in margins of joints before V views; of ``CONDITIONING`` their number."""
     if kind >= CLEAR:
         return 1 + (CLEAR - FRONT) * views + kind - CLEAR
     return 1 + (kind - FRONT) * views if kind >= FRONT else 0
@@ -108,18 +108,18 @@ _MOST_PARTS = 256
 class Demands(NamedTuple):
     """Constraints of a planned motion."""
 
-    limits: JointLimits  # of the joints
-    image_size: FloatArray  # (V, 2) width and height of each image, px; infinite where it has no border
+    limits: JointLimits  # limits of the joints
+    image_size: FloatArray  # (V, 2) width and height of each image, px; infinite if it has no border
     border_px: float  # minimum distance of a marker from the border of an image, px
     conditioning: float  # minimum reciprocal condition number of the image Jacobian of the face
     keep: FloatArray  # (n,) minimum distance from a joint limit, rad or m, along a path through joint space
     min_face_px: float = 0.0  # minimum width of the face in an image along such a path, px
     # (t, 4) corners of tags, markers of the body in the order of their numbers, of which one is to be seen by
-    # enough cameras; none where the face is
+    # enough cameras; none if the face is
     tags: IntArray = np.zeros((0, 4), np.int64)
-    units: tuple[str, ...] = ()  # of each joint in messages: deg, rad or m
+    units: tuple[str, ...] = ()  # unit of each joint in messages: deg, rad or m
     view: tuple[str, ...] = VIEWS  # names of the views
-    least_views: int = 0  # number of views that are to see the face, the best ones; 0 for all
+    min_views: int = 0  # number of views that are to see the face, the best ones; 0 for all
 
 
 def limits_alone(limits: JointLimits, views: int = len(VIEWS)) -> Demands:
@@ -145,7 +145,7 @@ class Reaching(NamedTuple):
     O: FloatArray  # (V, 4) optical centres
     visible: FloatArray  # (V,) sign of a·O on the visible side of the face
     q_start: FloatArray  # (n,) joints at the start, rad or m
-    # (b, 4) all markers of the body at the start, those of the face first
+    # (b, 4) all markers of the body at the start, the face first
     body: FloatArray = np.zeros((0, 4))
 
 
@@ -155,12 +155,12 @@ class Along(NamedTuple):
     H_d: FloatArray  # (s, 4, 4) displacement of the face
     s: FloatArray  # (s, V, m, 2) its images, px
     visibility: FloatArray  # (s, V) margins a·O, 1 at the start
-    # (s, V) minimum distance of a marker from the image border, px; ``BEHIND`` where none shows it
+    # (s, V) minimum distance of a marker from the image border, px; ``BEHIND`` if none shows it
     distance: FloatArray
     q: FloatArray  # (s, n) joints, rad or m; NaN from where they cannot follow
     limit: FloatArray  # (s,) margins of the joint limits, NaN likewise
     condition: FloatArray  # (s,) reciprocal conditions of the image Jacobian, NaN likewise
-    # (s, 4) the smallest of each of ``OF_MOTION``; ``_WORST`` where the joints cannot follow
+    # (s, 4) the smallest of each of ``OF_MOTION``; ``_WORST`` if the joints cannot follow
     margins: FloatArray
 
 
@@ -179,7 +179,7 @@ class Motion(NamedTuple):
     along: Along  # quantities along it
 
     def shares(self) -> FloatArray:
-        """Each margin (s, 4) over that at the worse of both ends, or over 1 where that is not positive."""
+        """Each margin (s, 4) over that at the worse of both ends, or over 1 if that is not positive."""
         margins = self.along.margins
         worse = np.minimum(margins[0], margins[-1])
         return np.asarray(margins / np.where(worse > 0.0, worse, 1.0))
@@ -245,7 +245,7 @@ def carrier_of(reaching: Reaching) -> Carrier:
     n = len(reaching.q_start)
     rows = rows_of(len(reaching.O), len(reaching.A))
     work = workspace(n, rows, make_span(reaching.model, reaching.A))
-    # Every other number of names would be a type of its own, to compile for.
+    # Every other number of names would be a separate type to compile.
     nameless = reaching.demands._replace(units=(), view=())
     return Carrier(reaching._replace(demands=nameless), work, np.empty(n))
 
@@ -258,10 +258,10 @@ def carry_joints(
     """Carry the joints ``q``, in place, along a straight piece of path in equal parts.
 
     ends : shares (3,) at both ends.
-    parts : how many; of none the joints stay where they are.
+    parts : how many; of none the joints stay if they are.
     settled : Newton step, rad or m, that is the last of a part.
     stride : most that a part may move a joint, rad or m.
-    Returns reciprocal condition of the image Jacobian there; −1 where a part does not settle or moves too
+    Returns reciprocal condition of the image Jacobian there; −1 if a part does not settle or moves too
     far.
     """
     reaching, work, before = carrier.reaching, carrier.work, carrier.before
@@ -320,7 +320,7 @@ def displacements_into(reaching: Reaching, mu: FloatArray, along: Along) -> None
 def carried_into(carrier: Carrier, mu: FloatArray, along: Along) -> None:
     """Write displacements, joints, limit and condition at shares mu (s, 3), from the joints at the first on.
 
-    Where the joints would move too far between two of them, the path is made in parts.
+    If the joints would move too far between two of them, the path is made in parts.
     """
     displacements_into(carrier.reaching, mu, along)
     for i in range(mu.shape[0]):
@@ -352,7 +352,7 @@ def _moved_into(carrier: Carrier, along: Along) -> None:
 
 
 def along_shares(reaching: Reaching, mu: FloatArray, q: FloatArray | None = None) -> Motion:
-    """The motion of shares mu (s, 3) from joints q (n,) at the first; none where it begins at the start."""
+    """The motion of shares mu (s, 3) from joints q (n,) at the first; none if it begins at the start."""
     along = room_along(reaching, len(mu))
     along.q[0] = reaching.q_start if q is None else q
     carried_into(carrier_of(reaching), np.ascontiguousarray(mu), along)
@@ -368,10 +368,10 @@ def along_joints(reaching: Reaching, q: FloatArray) -> Motion:
 
 
 def measured(motion: Motion) -> Motion:
-    """The motion with its images, visibility, distances and margins, where all else is known.
+    """The motion with its images, visibility, distances and margins, if the rest is known.
 
     Visibility is the dual motion of the optical centres against planes, [RH00] section 4.2. Of tags it and
-    the distance are those of the tag that keeps them best.
+    the distance are taken from the tag that keeps them best.
     """
     reaching, along = motion.reaching, motion.along
     demands, model, m = reaching.demands, reaching.model, len(reaching.A)
@@ -402,9 +402,9 @@ def measured(motion: Motion) -> Motion:
 def best_views(
     demands: Demands, visibility: FloatArray, distance: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Visibility and distance from the border, px, (..., V) both, of the best views that are asked for."""
+    """Visibility and distance from the border, px, (..., V) both, of the required number of best views."""
     worse = np.minimum(visibility, image_margin(demands, distance))
-    best = np.argsort(-worse, axis=-1, kind="stable")[..., : demands.least_views or worse.shape[-1]]
+    best = np.argsort(-worse, axis=-1, kind="stable")[..., : demands.min_views or worse.shape[-1]]
     return np.take_along_axis(visibility, best, -1), np.take_along_axis(distance, best, -1)
 
 

@@ -25,13 +25,13 @@ _CANDIDATES, _TARGETS = 300, 150
 _BATCHES = 20
 # Markers that both views must see at a pose that determines the joints.
 _LEAST_SEEN = 3
-# Poses to choose from for a camera that moved, and the most that are chosen.
+# Poses to choose from for a camera that moved, and the maximum number that are chosen.
 _REFIT_CANDIDATES, _MOST_POSES = 150, 30
 # Error of a camera that is fitted again, over that before it moved, at which poses are enough.
 _ENOUGH = 1.5
 # Markers that suggestions are judged by, at most.
 _MOST_SHOWN = 25
-# A prediction that errs by more than this share of the image does not say what will be seen.
+# A prediction that errs by more than this share of the image does not predict the view.
 _VAGUE = 0.02
 
 
@@ -53,7 +53,7 @@ def region_around(
     """Region of the recorded readings, widened at each end by a share of their range within limits (n,).
 
     A recorded robot may have been where its limits do not reach. Of images without a ``size`` the region is
-    that of the pixels seen.
+    of the pixels seen.
     """
     q, pixels = observation.q, observation.images
     least, most = q.min(axis=0), q.max(axis=0)
@@ -77,9 +77,9 @@ def suggest(
 
     V-optimality, the mean variance over a region, taken greedily over random candidates: A. C.
     Atkinson, A. N. Donev, R. D. Tobias, "Optimum Experimental Designs, with SAS", 2007, chapter 10.
-    With Λ Λᵀ the covariance, C the derivative of the images of a pose and T that of the targets,
-    both times Λ, the pose leaves tr T (I + Cᵀ C / σ²)⁻¹ Tᵀ. Markers count as seen where they are
-    predicted within the image; of many markers some stand for all.
+    With Λ Λᵀ the covariance, C the derivative of the images of a pose and T the derivative of the targets,
+    both times Λ, the pose leaves tr T (I + Cᵀ C / σ²)⁻¹ Tᵀ. Markers count as seen if they are
+    predicted within the image; some of many markers represent all.
 
     calibration : with its covariance.
     observation : the observations of the calibration.
@@ -128,15 +128,15 @@ class RefitPoses:
     """Poses for a camera that moved, in the order of choice."""
 
     q: FloatArray  # (k, n) joint readings, rad or m
-    error_px: float  # of its images in the region after a refit from them, rms of distances
-    before_px: float  # of its images before it moved
+    error_px: float  # error of its images in the region after a refit from them, rms of distances
+    before_px: float  # error of its images before it moved
 
 
 def refit_poses(calibration: Calibration, v: int, region: Region, rng: np.random.Generator) -> RefitPoses:
     """Poses from which a camera that moved is fitted again nearly as well as it was.
 
     Greedily the ones after which its images err least over the region: by the camera's errors from noise, and
-    by those of operators and markers that it follows, −G T e as in ``calibration.refit``. The poses that it
+    by errors of operators and markers that it follows, −G T e as in ``calibration.refit``. The poses that it
     sees are those from where it was.
 
     v : its index; region : of the poses, with the border of each image.
@@ -146,8 +146,8 @@ def refit_poses(calibration: Calibration, v: int, region: Region, rng: np.random
     scene, others = parameters_from(few), np.arange(len(few.view)) != v
     poses, seen = list[FloatArray](), list[BoolArray]()
     for q, in_view in drawn_poses(few, region, _BATCHES, rng):
-        shown = in_view.sum(axis=2) >= _LEAST_SEEN
-        good = np.flatnonzero(shown[:, v] & (shown[:, others].any(axis=1) | ~others.any()))
+        enough_seen = in_view.sum(axis=2) >= _LEAST_SEEN
+        good = np.flatnonzero(enough_seen[:, v] & (enough_seen[:, others].any(axis=1) | ~others.any()))
         good = good[: _REFIT_CANDIDATES - len(poses)]
         poses, seen = [*poses, *q[good]], [*seen, *in_view[good, v]]
         if len(poses) == _REFIT_CANDIDATES:

@@ -52,18 +52,18 @@ def spread_of(
     face: int,
     bounds: _Bounds,
     seed: int,
-    least_views: int,
+    min_views: int,
 ) -> Spread:
-    """Return the prediction errors of markers by their indices, those of the face first.
+    """Return the prediction errors of markers by their indices, the face first.
 
     The directions are those that move the images of the face most, among joints drawn at random that show it
-    in so many views; the rest is taken as constant. None without a covariance. It takes 20 ms, once for all
-    tasks of a calibration.
+    in ``min_views`` views; the rest is taken as constant. None without a covariance. It takes 20 ms, once for
+    all tasks of a calibration.
     """
     if not calibration.has_covariance:
         return NO_SPREAD
     calibration = calibration.with_markers(list(indices))
-    q = _showing(calibration, face, bounds, seed, least_views)
+    q = _showing(calibration, face, bounds, seed, min_views)
     if len(q) == 0:
         return NO_SPREAD
     scene, factor = parameters_from(calibration), error_factor(calibration)
@@ -83,19 +83,19 @@ def spread_of(
         H_hat=np.concatenate([model.H_hat_0[None], model.H_hat_0 + H_hat.reshape(-1, n, 4, 4)]),
         M=np.concatenate([calibration.M[None], calibration.M + M.reshape(-1, b, 4)]),
         rest=rest,
-        most=float(np.sqrt(variance.max())),
+        max_sigma=float(np.sqrt(variance.max())),
     )
 
 
-def _showing(calibration: Calibration, face: int, bounds: _Bounds, seed: int, least_views: int) -> FloatArray:
-    """Joints (k, n) within the limits at which enough images hold the first markers, those of the face."""
+def _showing(calibration: Calibration, face: int, bounds: _Bounds, seed: int, min_views: int) -> FloatArray:
+    """Joints (k, n) within the limits at which enough images hold the first markers, the face."""
     lower, upper, image_size = bounds
     low = np.where(np.isfinite(lower), lower, calibration.q_reference - np.pi)
     high = np.where(np.isfinite(upper), upper, calibration.q_reference + np.pi)
     corners = image_corners(np.array(image_size, dtype=np.float64))
     region, joints = Region(low, high, corners), np.zeros((0, len(low)))
     for q, in_view in drawn_poses(calibration, region, _MOST_BATCHES, np.random.default_rng(seed)):
-        joints = np.concatenate([joints, q[in_view[:, :, :face].all(axis=2).sum(axis=1) >= least_views]])
+        joints = np.concatenate([joints, q[in_view[:, :, :face].all(axis=2).sum(axis=1) >= min_views]])
         if len(joints) >= _LOOKED_AT:
             break
     return joints[:_LOOKED_AT]

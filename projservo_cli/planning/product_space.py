@@ -2,8 +2,8 @@
 
 The coupled constraint of the paper on μ_t and μ_r, for both cameras, with the image borders, the
 joint limits and the conditioning of the operators. Of all monotone paths from (0, 0, 0) to (1, 1, 1)
-on a lattice of shares μ_t, μ_r, μ_p the one whose smallest margin, in shares of the least ones, is largest is
-taken, among equals the quickest.
+on a lattice of shares μ_t, μ_r, μ_p the one whose smallest margin, in shares of the required ones, is largest
+is taken, among equals the quickest.
 """
 
 import itertools
@@ -35,15 +35,16 @@ from projservo_cli.planning.motion_margins import (
 from projservo_cli.planning.time_parameterization import minimum_time
 from projservo_cli.records import BoolArray, FloatArray, IntArray
 
-# Values of each share; the second where no path stays in view on the first.
+# Values of each share; the second if no path stays in view on the first.
 _NODES = (13, 19)
 # A joint that moves more than this between two nodes, rad or m, has changed its branch.
 _MOST_STRIDE = 1.5
-# Parts in which the path between them is made where the joints do not settle in one.
+# Parts in which the path between them is made if the joints do not settle in one.
 _BETWEEN = 4
-# Newton step, rad or m, after which joints at a node are good enough: they are off by its square.
+# Newton step, rad or m, after which joints at a node are good enough: they err by its square.
 _ROUGH = 1e-2
-# Of two paths equally short, that with longer straight steps: a share of the duration of a rad at 1 rad/s.
+# Between two paths equally short, the one with longer straight steps: a share of the duration of a rad at 1
+# rad/s.
 _STRAIGHTER = 1e-4
 # A straight piece may take this much longer than the steps of the lattice that it replaces.
 _DETOUR = 1.01
@@ -56,7 +57,7 @@ _SIGHT = [OF_MOTION.index(VISIBILITY), OF_MOTION.index(IMAGE)]
 
 
 def duration(motion: Motion) -> float:
-    """Time a motion takes at the joint-speed limit, s; NaN where nothing limits or joints cannot follow."""
+    """Time a motion takes at the joint-speed limit, s; NaN if nothing limits or joints cannot follow."""
     speed = motion.reaching.demands.limits.speed
     return float(minimum_time(speed, motion.along.q)[-1]) if np.isfinite(speed).any() else math.nan
 
@@ -64,7 +65,7 @@ def duration(motion: Motion) -> float:
 def evenly(motion: Motion, sigma: FloatArray) -> FloatArray:
     """Shares (k, 3) at parts sigma (k,) of the duration, or of the motion of the joint that moves most.
 
-    Where the joints cannot follow or nothing moves, of the length of the path in shares.
+    If the joints cannot follow or nothing moves, of the length of the path in shares.
     """
     time = minimum_time(motion.reaching.demands.limits.speed, motion.along.q)
     if not time[-1] > 0.0:
@@ -77,8 +78,8 @@ def evenly(motion: Motion, sigma: FloatArray) -> FloatArray:
 def plan_path(reaching: Reaching) -> Motion:
     """Path whose smallest share is as good as any, and among those the quickest.
 
-    Other senses of the rotations are looked at where they may be the better: from a quarter turn within the
-    plane on, or where the shorter ones lead through what must not happen. Where no path keeps all
+    Other senses of the rotations are looked at if they may be the better: from a quarter turn within the
+    plane on, or if the shorter ones lead through violations. If no path keeps all
     constraints, one is taken that keeps at least the face in sight and in both images.
     """
     short = abs(float(reaching.amplitudes[2])) <= 0.5 * math.pi
@@ -126,7 +127,7 @@ class _Lattice(NamedTuple):
     """Constraints at the values of each share."""
 
     nodes: Motion  # through all k³ nodes, in the order of C, of which only neighbours are near to one another
-    follows: bool  # whether joints do, and count; else what takes time are the shares themselves
+    follows: bool  # whether joints follow, and count; otherwise the shares themselves take time
 
     @property
     def worth(self) -> float:
@@ -148,7 +149,7 @@ class _Lattice(NamedTuple):
 
 
 def _in_view(reaching: Reaching, size: int) -> _Lattice:
-    """A lattice of the views alone, with so many values of each share."""
+    """A lattice of the views alone, with ``size`` values of each share."""
     mu = np.ascontiguousarray(np.indices((size, size, size)).reshape(3, -1).T / (size - 1.0))
     along = room_along(reaching, len(mu))
     displacements_into(reaching, mu, along)
@@ -229,7 +230,7 @@ def shortest(free: BoolArray, q: FloatArray, speed: FloatArray) -> IntArray:
 
 @merged
 def _before(node: int, step: int, size: int) -> int:
-    """The node a step before another, −1 where there is none; bits of a step are those of μ_t, μ_r, μ_p."""
+    """The node a step before another, −1 if there is none; bits of a step stand for μ_t, μ_r, μ_p."""
     a, b, c = step >> 2, step >> 1 & 1, step & 1
     if node // (size * size) < a or node // size % size < b or node % size < c:
         return -1
@@ -269,7 +270,7 @@ def _joints_into(carrier: Carrier, mu: FloatArray, value: FloatArray, size: int,
     """Write joints, limit and condition at those nodes (size³,) whose value is positive.
 
     Each is continued from the best before it: the values become the minimum margin of both on the path there,
-    zero where the joints cannot follow within both.
+    zero if the joints cannot follow within both.
     """
     demands = carrier.reaching.demands
     for node in range(mu.shape[0]):

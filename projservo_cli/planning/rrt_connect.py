@@ -1,7 +1,7 @@
 """Path in joint space to a goal configuration: straight, or by RRT-Connect; or the reason for none.
 
 J. Kuffner, S. LaValle, "RRT-Connect: an efficient approach to single-query path planning", ICRA 2000. It is
-shortened, blended and timed. Random numbers are those of a seed and drawn before the trees grow: a
+shortened, blended and timed. Random numbers come from a seed and are drawn before the trees grow: a
 path is the same to the bit on any number of processors.
 """
 
@@ -35,7 +35,7 @@ _LEAST = 1e-9
 _CHUNK = 250
 # Number of paths of the search, and draws after which no further one begins.
 _WAYS, _FURTHER = 2, 300
-# A straight line that takes so much longer than to the nearest goal is held against what trees find.
+# A straight line that takes this much longer than to the nearest goal is compared with paths of trees.
 _LONGER = 1.2
 _SHORTENINGS = 60
 _ROUND_OFF = 1e-9
@@ -71,10 +71,10 @@ class JointPath(NamedTuple):
     failures: IntArray  # (c + n,) how often each margin, and each joint's limit, stopped the search
     start_clearance: FloatArray  # (c,) margins of the start
     region: int  # the one that the start is within, counted from 1; 0 for none
-    constraints: Constraints  # with less asked for at start and goals
-    corners: FloatArray  # (k, n) of the path; none where none was found
-    timing: TimedPath | None = None  # in time; None where there is no path or nothing limits its speed
-    draws: int = 0  # by the trees
+    constraints: Constraints  # constraints, relaxed at start and goals
+    corners: FloatArray  # (k, n) of the path; none if none was found
+    timing: TimedPath | None = None  # path in time; None if there is no path or nothing limits its speed
+    draws: int = 0  # draws by the trees
     trees: tuple[Tree, Tree] | None = None  # from the start and from the goals, where they were grown
 
 
@@ -84,10 +84,10 @@ def may_start(clearance: FloatArray) -> bool:
 
 
 def with_ends(c: Constraints, ends: FloatArray) -> Constraints:
-    """Constraints that ask of joints (k, n), and near them, for no more than a share of what those have.
+    """Constraints relaxed at joints (k, n), and near them, to a share of the margins there.
 
     Their images were measured, so that no deviation of a prediction reduces their margins. Joints of which
-    that share is as much as is asked for everywhere are asked for no less.
+    that share meets the full requirement are not relaxed.
     """
     demands = np.array([margins_at(c, q)[0] for q in ends])
     measured = np.array([margins_at(c._replace(spread=NO_SPREAD), q)[0] for q in ends])
@@ -126,7 +126,7 @@ def _clear(c: Constraints) -> int:
 def first_within(c: Constraints, q: FloatArray) -> tuple[int, int]:
     """The last of joints (s, n) up to which a path keeps out of regions, and the number of the one it enters.
 
-    All but the regions is left aside. The last of all and 0 where it enters none.
+    All but the regions is left aside. The last of all and 0 if it enters none.
     """
     n = q.shape[1]
     endless = np.full(n, math.inf)
@@ -161,7 +161,7 @@ def find_path(
     far = np.all(np.max(off, axis=2, initial=0.0) > _NEARBY, axis=1)
     goals, rank = goals[far], rank[far]
     clearance, _ = margins_at(c._replace(spread=NO_SPREAD), start)
-    clearance[columns_of_kind(IMAGE, len(c.O))] += DEVIATIONS * c.spread.most  # the face was seen there
+    clearance[columns_of_kind(IMAGE, len(c.O))] += DEVIATIONS * c.spread.max_sigma  # the face was seen there
     trial = new_trial(c)
     path = JointPath(
         goals=goals,
@@ -192,7 +192,7 @@ def find_path(
 
 
 def _drawn(c: Constraints, start: FloatArray, count: int, rng: np.random.Generator) -> FloatArray:
-    """Random joints (count, n) within the limits; within half a turn of the start where there are none."""
+    """Random joints (count, n) within the limits; within half a turn of the start if there are none."""
     low = np.where(np.isfinite(c.limits.lower), c.limits.lower, start - np.pi)
     high = np.where(np.isfinite(c.limits.upper), c.limits.upper, start + np.pi)
     return np.asarray(low + (high - low) * rng.random((count, len(start))))
@@ -206,10 +206,10 @@ def _shortest(
     rng: np.random.Generator,
     trial: Trial,
 ) -> tuple[FloatArray, int, tuple[Tree, Tree] | None]:
-    """The shortest path (k, n) that was found to any of the goals (g, n), in so many draws of joints.
+    """The shortest path (k, n) that was found to any of the goals (g, n), within a number of draws of joints.
 
-    A straight one, if it takes little longer than to the nearest goal; else the best of some that trees find.
-    Returns the path, empty where there is none; the draws it took; the trees that found it, or the first.
+    A straight one, if it takes little longer than to the nearest goal; otherwise the best of some paths of
+    trees. Returns the path, empty if there is none; the draws it took; the trees that found it, or the first.
     """
     best, shortest, draws = np.empty((0, len(start))), math.inf, 0
     straight = next((goal for goal in goals if reached(c, start, goal, trial) == 1.0), None)
@@ -239,7 +239,7 @@ def _by_trees(
     rng: np.random.Generator,
     trial: Trial,
 ) -> tuple[FloatArray | None, int, tuple[Tree, Tree]]:
-    """A path of corners (k, n), None where none was found; how many draws it took; the trees."""
+    """A path of corners (k, n), None if none was found; how many draws it took; the trees."""
     nodes = min(max_draws, 100_000) * 4 + len(goals)
     trees = _new_tree(nodes, start[None]), _new_tree(nodes, goals)
     draws = 0
@@ -255,7 +255,7 @@ def _by_trees(
 
 
 def _new_tree(max_draws: int, roots: FloatArray) -> Tree:
-    """A tree of roots (r, n) with room for so many nodes."""
+    """A tree of roots (r, n) with room for ``max_draws`` nodes."""
     q = np.empty((max(max_draws, len(roots)), roots.shape[1]))
     q[: len(roots)] = roots
     return Tree(q, np.full(len(q), -1), np.array([len(roots)]))
@@ -311,7 +311,7 @@ def _extended(c: Constraints, tree: Tree, q: FloatArray, trial: Trial) -> tuple[
 def _grow(c: Constraints, trees: tuple[Tree, Tree], draws: FloatArray, trial: Trial) -> tuple[int, int, int]:
     """Grow two trees towards drawn joints (k, n) and each other until they meet.
 
-    Returns the nodes of both at which they met, −1 where they did not; how many draws it took.
+    Returns the nodes of both at which they met, −1 if they did not; how many draws it took.
     """
     for k in range(draws.shape[0]):
         first = trees[0] if k % 2 == 0 else trees[1]

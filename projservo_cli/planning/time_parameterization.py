@@ -42,9 +42,9 @@ class TimedPath(NamedTuple):
 
 
 def minimum_time(speed: FloatArray, q: FloatArray) -> FloatArray:
-    """Time (s,) at which joints q (s, n) are reached where one is always at its speed limit (n,), s.
+    """Time (s,) at which joints q (s, n) are reached if one is always at its speed limit (n,), s.
 
-    Where nothing limits, the motion of the joint that moves most.
+    If nothing limits, the motion of the joint that moves most.
     """
     speed = speed if np.isfinite(speed).any() else np.ones_like(speed)
     return np.concatenate([[0.0], np.cumsum((np.abs(np.diff(q, axis=0)) / speed).max(axis=1))])

@@ -1,6 +1,6 @@
 """Runs that move: the 3D view, one page of HTML that needs no network, and the animation of the images.
 
-The view is drawn by plotly and has a time slider; the animation has a column a law.
+The view is drawn by plotly and has a time slider; the animation has a column per law.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -35,12 +35,12 @@ from projservo_cli.task.face import center_of
 
 _MOST_INSTANTS = 60
 _DOTS = 9  # on the planned path
-_DIGITS = 4  # of coordinates in m: a tenth of a millimetre
+_DIGITS = 4  # digits of coordinates in m: a tenth of a millimetre
 _HEIGHT = 640  # px of the scene
 _EYE = 1.75  # distance of the eye, in sizes of the scene
-_LOWER = 0.15  # that it looks below the middle, where the names of the axes are
+_LOWER = 0.15  # that it looks below the middle, if the names of the axes are
 _PAD = 0.03  # around all that is shown, as a share of it
-FRAME_MS, LAST_MS = 80, 2000  # what each frame of view and animation lasts, and the last of the animation
+FRAME_MS, LAST_MS = 80, 2000  # duration of each frame, and of the animation's last
 _TOOLS = ["orbitRotation", "pan3d", "zoom3d", "resetCameraDefault3d", "toImage"]  # none leaves the page
 # A scene that is wider than high needs more distance on a narrow page.
 _NEARER = """
@@ -70,7 +70,7 @@ class _Driven(NamedTuple):
     verdict: str
     seconds: FloatArray  # (k,)
     hidden: BoolArray  # (k, V) whether the face is hidden from each camera
-    path: FloatArray  # (t, 3) centre of what moves, face or cameras, at every instant of the run
+    path: FloatArray  # (t, 3) centre of the moving part, face or cameras, at every instant of the run
     robot: FloatArray  # (k, j, 3) from its base to the tool
     face: FloatArray  # (k, m, 3) in cyclic order
     markers: FloatArray  # (k, p, 3)
@@ -82,12 +82,13 @@ class _Motion(NamedTuple):
     """Static parts of the view, in m in the base frame, and the runs by name."""
 
     view: tuple[str, ...]  # names of the views
-    on_tool: bool  # whether the cameras move, and the face stands still
+    on_tool: bool  # whether the cameras move, and the face is fixed
     cameras: FloatArray  # (V, 5, 3) optical centre and image corners of the viewing pyramids at the start
     start: FloatArray  # (m, 3) corners of the face
-    # (e, 3) line around it, or along the pyramids, at the goal; None where only images of it are known
+    # (e, 3) line around it, or along the pyramids, at the goal; None if only images of it are known
     goal: FloatArray | None
-    planned: FloatArray  # (s, 3) centre of what moves along the joints of the plan, as far as they follow it
+    # (s, 3) centre of the moving part along the joints of the plan, as far as they follow it
+    planned: FloatArray
     # (e, 3) centre of the face along the edges of each search tree, NaN between
     trees: tuple[FloatArray, ...]
     features: FloatArray  # (e, 3) line along the features of the scene
@@ -187,7 +188,7 @@ def write_view(path: Path, motion: _Motion, *, name: str, known: str) -> None:
 
 
 def _figure(motion: _Motion) -> Any:
-    """The view as a figure of plotly: what stands still, then the traces of each run, a frame an instant."""
+    """The view as a figure of plotly: the fixed parts, then the traces of each run, a frame per instant."""
     go = plotly()
     menu: list[dict[str, Any]] = []
     traces, frames = [*_still(go, motion)], []
@@ -250,7 +251,7 @@ def _scene(motion: _Motion, reach: Mapping[str, list[float]]) -> dict[str, Any]:
 
 
 def _extent(motion: _Motion, run: _Driven) -> dict[str, list[float]]:
-    """Range of each coordinate that a run keeps to, so that the scene stands still while the robot moves."""
+    """Range of each coordinate over a run, so that the scene does not shift while the robot moves."""
     points = [motion.cameras, motion.start, run.robot, run.markers, run.path, run.cameras, motion.planned]
     points += [motion.features, run.features]
     points += [*([] if motion.goal is None else [motion.goal]), *motion.trees]
@@ -262,7 +263,7 @@ def _extent(motion: _Motion, run: _Driven) -> dict[str, list[float]]:
 
 
 def _slider(run: _Driven, names: list[str], views: tuple[str, ...]) -> dict[str, Any]:
-    """A step for each instant; its label stands above the slider."""
+    """A step for each instant; its label is above the slider."""
     steps = []
     for name, seconds, hidden in zip(names, run.seconds, run.hidden, strict=True):
         blind = " and ".join(name for name, behind in zip(views, hidden, strict=True) if behind)
@@ -317,7 +318,7 @@ def _moving(go: Any, motion: _Motion, run: _Driven, k: int) -> list[Any]:
 
 
 def _line(go: Any, points: FloatArray, name: str, color: str, width: float | None = None) -> Any:
-    """A line of a width, or points where there is none."""
+    """A line of a width, or points if there is none."""
     line_style = {"mode": "markers", "marker": {"size": 3, "color": color}}
     if width is not None:
         line_style = {"mode": "lines", "line": {"color": color, "width": width}}
@@ -351,8 +352,8 @@ def write_animation(
 ) -> None:
     """Write the animation of runs as GIF: the first direct law and the classical ones side by side.
 
-    ``order`` are the markers around the face, ``size`` is that of the images in px; where it is not known,
-    the animation shows what reaches around all that was seen. Where the runs have frames, these are shown.
+    ``order`` are the markers around the face, ``size`` is the size of the images in px; if it is not known,
+    the animation shows the range of all observed pixels. If the runs have frames, these are shown.
     """
     from PIL import Image
 
@@ -367,7 +368,7 @@ def write_animation(
     for pixels in _frames(columns, order, sizes):
         images.append(Image.fromarray(pixels))
         progress("animation", len(images), _FRAMES)
-    # The last frame has all colours; one palette for all keeps what does not move the same.
+    # The last frame has all colours; one palette for all keeps fixed parts the same.
     palette = images[-1].quantize(_COLORS, method=Image.Quantize.MAXCOVERAGE)
     colors = np.array((palette.getpalette() or [])[: 3 * _COLORS]).reshape(-1, 3)
     greys = np.linspace(0, _NEAR_WHITE, 256 - len(colors)).round().astype(np.int64)[:, None].repeat(3, axis=1)
@@ -380,7 +381,7 @@ def write_animation(
 
 
 def _frames(traces: Mapping[str, Trace], order: IntArray, sizes: FloatArray) -> Iterator[Any]:
-    """Draw one frame after another, a column a run; yields the pixels (height, width, 3) of each.
+    """Draw one frame after another, a column per run; yields the pixels (height, width, 3) of each.
 
     They go from the start to the end of the longest run that converged, if any did.
     """
@@ -429,7 +430,7 @@ def _frames(traces: Mapping[str, Trace], order: IntArray, sizes: FloatArray) -> 
 
 
 class _Panel:
-    """One image under one law: start and goal, and what moves: paths, a face, hidden or not, and features.
+    """One image under one law: start and goal, and moving parts: paths, a face, hidden or not, and features.
 
     order : the markers around the face.
     """

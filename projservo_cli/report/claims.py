@@ -28,9 +28,9 @@ from projservo_cli.report.figures.path_deviation import study_numbers
 
 
 class _Claim(NamedTuple):
-    """One claim of the paper, where it stands, its measure in words, when it holds, and whether it does.
+    """One claim of the paper, its source, its measure in words, its criterion, and whether it holds.
 
-    ``holds`` is None where it could not be measured.
+    ``holds`` is None if it could not be measured.
     """
 
     claim: str
@@ -51,14 +51,14 @@ class _Row(NamedTuple):
 
 
 class _Subject(NamedTuple):
-    """What claims are measured on; a measure yields numbers for each law or run that it can speak about."""
+    """Data for measures of claims; a measure yields numbers for each law or run that it applies to."""
 
     data: ReportData
-    composition: Composition | None  # of the parts of the task; None where it could not be computed
+    composition: Composition | None  # composition of the parts of the task; None if it could not be computed
 
     @property
     def studies(self) -> Studies:
-        """The extra runs, for claims that are judged only where there are some."""
+        """The extra runs, for claims that are judged only if there are some."""
         return self.data.extra
 
     @property
@@ -77,7 +77,7 @@ class _Table:
         self._rows: dict[_Measure, list[_Row]] = {}
 
     def claim(self, *row: Any) -> Callable[[_Measure], _Measure]:
-        """Decorator of a measure that adds a claim judged by it; arguments are those of ``_Row``."""
+        """Decorator of a measure that adds a claim judged by it; arguments as of ``_Row``."""
 
         def measured_by(measure: _Measure) -> _Measure:
             self._rows.setdefault(measure, []).insert(0, _Row(*row))  # the last decorator comes first
@@ -89,16 +89,16 @@ class _Table:
         """Measure, word and judge all claims; ``unknown`` says why none of them can be measured."""
         for measure, rows in self._rows.items():
             for numbers in measure(subject):
-                places = vars(numbers)
-                why = unknown or places.get("unknown", "")
+                values_of = vars(numbers)
+                why = unknown or values_of.get("unknown", "")
                 for claim, source, measured, criterion, holds in rows:
-                    held = None if why else holds(numbers)
+                    holds_here = None if why else holds(numbers)
                     yield _Claim(
-                        claim.format(**places),
+                        claim.format(**values_of),
                         source,
-                        why or measured.format(**places),
-                        criterion.format(**places),
-                        None if held is None else bool(held),
+                        why or measured.format(**values_of),
+                        criterion.format(**values_of),
+                        None if holds_here is None else bool(holds_here),
                     )
 
 
@@ -116,7 +116,7 @@ def _short(values: Iterable[float]) -> str:
 
 
 def _cameras(views: int, two: str, more: str) -> str:
-    """Cameras of a rig of so many views, with a word for two and another for more."""
+    """Cameras of a rig by its number of views, with a word for two and another for more."""
     return "the camera" if views == 1 else f"{two if views == 2 else more} camera{'s' * (two == 'both')}"
 
 
@@ -135,7 +135,7 @@ def _cameras(views: int, two: str, more: str) -> str:
     lambda n: n.verdict == "diverged",
 )
 def _blockwise(subject: _Subject) -> Iterator[Numbers]:
-    """How the block-wise law ends, and the distance of the centre where it is known, mm."""
+    """Verdict of the block-wise law, and the distance of the centre if it is known, mm."""
     trace, grown = subject.data.traces.get("blockwise"), ""
     if trace is None:
         return
@@ -222,7 +222,7 @@ def _hidden_steps(subject: _Subject) -> Iterator[Numbers]:
         )
 
 
-_SMALL_SHARE = 0.01  # of the diagonal of an image, that counts as very little
+_SMALL_SHARE = 0.01  # share of the diagonal of an image that counts as very little
 
 
 @_RUNS.claim(
@@ -267,7 +267,7 @@ def _to_polyline(points: FloatArray, path: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.norm(offset - share[..., None] * distance, axis=2).min(axis=1))
 
 
-_LEVEL_SHARE = 0.02  # of the variation of its abscissa, within which the ordinate of a level motion varies
+_LEVEL_SHARE = 0.02  # variation of the ordinate of a level motion, over that of its abscissa
 
 
 @_RUNS.claim(
@@ -278,7 +278,7 @@ _LEVEL_SHARE = 0.02  # of the variation of its abscissa, within which the ordina
     lambda n: n.level,
 )
 def _level(subject: _Subject) -> Iterator[Numbers]:
-    """How far abscissa and ordinate of the centre vary in the images under directTHREE, px."""
+    """Variation of abscissa and ordinate of the centre in the images under directTHREE, px."""
     if (trace := subject.data.traces.get(DIRECT[0])) is not None:
         travel, variation = np.ptp(subject.data.center_image(trace), axis=0).T
         yield Numbers(
@@ -330,22 +330,22 @@ def _drift_of_laws(subject: _Subject) -> Iterator[Numbers]:
 @_DRIFT.claim(
     "The path with joint velocities limited to {limit:g}° per step is the innermost",
     "section 6, Fig. 8",
-    "{limited:.3g} mm with the limit, {free} mm without at gains {gains}; at gain {least_gain:g} "
+    "{limited:.3g} mm with the limit, {free} mm without at gains {gains}; at gain {min_gain:g} "
     "no joint turns by more than {turn:.2g}° in a step",
     "smaller than without the limit at every gain (directTHREE, true operators)",
-    lambda n: n.limited < n.least,
+    lambda n: n.limited < n.min_free,
 )
 def _innermost(subject: _Subject) -> Iterator[Numbers]:
     """Drift of directTHREE with true operators, mm, and the longest turn of a joint in a slow step, deg."""
-    (free, limited), least = subject.drift[0, 0], min(subject.studies.gains)
+    (free, limited), low_gain = subject.drift[0, 0], min(subject.studies.gains)
     yield Numbers(
         limit=subject.studies.step_limit_deg,
         limited=float(limited.max()),
         free=_listed(free),
         gains=_short(subject.studies.gains),
-        least_gain=least,
-        turn=_longest_turn(subject, subject.studies.sweep[DIRECT[0], "true", False, least]),
-        least=free.min(),
+        min_gain=low_gain,
+        turn=_longest_turn(subject, subject.studies.sweep[DIRECT[0], "true", False, low_gain]),
+        min_free=free.min(),
     )
 
 
@@ -440,7 +440,7 @@ def _drift_of(trace: Trace) -> float:
     lambda n: n.two <= _EXACT_DEG < n.three,
 )
 def _bias(subject: _Subject) -> Iterator[Numbers]:
-    """How far exact steps of the direct laws turn the face off its planned rotation, deg; their drift, mm."""
+    """Deviation, deg, of exact steps of the direct laws from the planned rotation; their drift, mm."""
     if subject.composition is not None:
         three, two = np.degrees(subject.composition.bias)
         drift = [_drift_of(subject.studies.own[law, "true", False]) for law in DIRECT]
@@ -458,7 +458,7 @@ def _bias(subject: _Subject) -> Iterator[Numbers]:
     ),
 )
 def _fast(subject: _Subject) -> Iterator[Numbers]:
-    """How a run ends that takes most of the translation in a step, and drifts beside the configured one."""
+    """End of a run that takes most of the translation in a step, and drifts of it and the configured one."""
     trace, gains = subject.studies.further["fast"], subject.studies.gains_of_laws
     yield Numbers(
         verdict=trace.verdict,
@@ -479,7 +479,7 @@ def _fast(subject: _Subject) -> Iterator[Numbers]:
     lambda n: None if n.still else arrived(n.verdict) and n.drift < min(n.three, n.two),
 )
 def _tracked(subject: _Subject) -> Iterator[Numbers]:
-    """Drift along the plan, and of both direct laws that calculate it anew, mm."""
+    """Drift along the plan, and of both direct laws that recalculate it, mm."""
     tracked = subject.studies.further.get("tracked")
     if tracked is not None and tracked.center_deviation_mm is not None:
         three, two = (_drift_of(subject.studies.own[law, "calibrated", True]) for law in DIRECT)
@@ -492,7 +492,7 @@ def _still(subject: _Subject) -> bool:
     return bool(subject.drift[:, 0].max() < _NO_DRIFT_MM)
 
 
-# A curve follows an exponential where each step's factor is within this share of 1 - gain·period, over enough
+# A curve follows an exponential if each step's factor is within this share of 1 - gain·period, over enough
 # steps that are this long after the last one at the joint-speed limit, and down to errors that only
 # the calibration explains, m and rad.
 _FACTOR_TOLERANCE = 0.01
@@ -534,13 +534,13 @@ def _decay(subject: _Subject) -> Iterator[Numbers]:
         yield numbers
 
 
-def _settled(error: FloatArray, least: float) -> FloatArray:
-    """Errors before the first that is no larger than the least."""
-    return error[np.logical_and.accumulate(error > least)]
+def _settled(error: FloatArray, floor: float) -> FloatArray:
+    """Errors before the first that is no larger than the floor."""
+    return error[np.logical_and.accumulate(error > floor)]
 
 
 def _rate_of_decay(error: FloatArray, gain: float, period: float) -> tuple[float, float]:
-    """Fitted rate of an error (k,), 1/s, and how far the factor of a step is off that of a gain."""
+    """Fitted rate of an error (k,), 1/s, and the difference of the factor of a step from that of a gain."""
     slope = np.polyfit(np.arange(len(error)), np.log(error), 1)[0]
     off = np.abs(error[1:] / error[:-1] / (1.0 - gain * period) - 1.0).max()
     return (1.0 - math.exp(slope)) / period, float(off)
@@ -548,7 +548,7 @@ def _rate_of_decay(error: FloatArray, gain: float, period: float) -> tuple[float
 
 _MODEL_TOLERANCE_DEG = 1e-6
 _START_TOLERANCE_DEG = 0.5
-_VISIBLE_PX = 1.0  # by more than this a coordinate rises, or leaves the exponential
+_VISIBLE_PX = 1.0  # change by which a coordinate rises, or leaves the exponential
 _SCALE_TOLERANCE = 2.0  # within this τ agrees with the true distance, % of the start
 
 
@@ -592,19 +592,19 @@ def _scale(subject: _Subject) -> Iterator[Numbers]:
 @_CONTROL.claim(
     "θ_s starts at the overall rotation of the task, 180° in the paper",
     "section 6, Fig. 9",
-    "{start:.3f}°; true rotation {told}",
+    "{start:.3f}°; true rotation {stated}",
     f"within {_START_TOLERANCE_DEG:g}° of the true rotation",
     lambda n: None if math.isnan(n.off) else n.off <= _START_TOLERANCE_DEG,
 )
 def _rotation(subject: _Subject) -> Iterator[Numbers]:
-    """θ_s at the start and the rotation of the task, NaN where that is unknown, deg."""
+    """θ_s at the start and the rotation of the task, NaN if that is unknown, deg."""
     trace = subject.studies.own[DIRECT[1], "calibrated", False]
-    start, task, told = math.degrees(trace.theta_s[0]), math.nan, "unknown"
+    start, task, stated = math.degrees(trace.theta_s[0]), math.nan, "unknown"
     if np.isfinite(trace.goal_pose).all():
         R = trace.pose[0, :3, :3].T @ trace.goal_pose[:3, :3]
         task = math.degrees(Rotation.from_matrix(R).magnitude())
-        told = f"{task:.3f}°"
-    yield Numbers(start=start, told=told, off=abs(start - task))
+        stated = f"{task:.3f}°"
+    yield Numbers(start=start, stated=stated, off=abs(start - task))
 
 
 @_CONTROL.claim(
@@ -622,7 +622,7 @@ def _rotation(subject: _Subject) -> Iterator[Numbers]:
     lambda n: n.rising > 0,
 )
 def _image_error(subject: _Subject) -> Iterator[Numbers]:
-    """How far image errors are off a decay by a factor per step, and rise above their minimum, px."""
+    """Differences of image errors from a decay by a factor per step, and rise above their minimum, px."""
     trace = subject.studies.own[DIRECT[0], "calibrated", False]
     e = trace.s - trace.s_star
     decay = (1.0 - subject.studies.gains_of_laws.gain_t * trace.period) ** np.arange(len(e))
@@ -648,7 +648,7 @@ _SAME_OPERATOR = 1e-9  # share of an operator within which another is the same
     lambda n: n.off <= _SAME_OPERATOR,
 )
 def _group_to_algebra(subject: _Subject) -> Iterator[Numbers]:
-    """Largest share by which operators of trial motions, known up to scale, are off."""
+    """Largest share by which operators of trial motions, known up to scale, err."""
     model, A = subject.data.calibrated, subject.data.plan.A
     off = 0.0
     for H_hat, slides in zip(model.H_hat_0, model.prismatic, strict=True):
@@ -659,7 +659,7 @@ def _group_to_algebra(subject: _Subject) -> Iterator[Numbers]:
     yield Numbers(trial=_TRIAL, off=off)
 
 
-_EQUAL_M = 1e-9  # both sides of (22) agree where the centre is moved to within this of the same place
+_EQUAL_M = 1e-9  # both sides of (22) agree if the centre is moved to within this of the same place
 
 
 @_EQUATION.claim(
@@ -667,11 +667,11 @@ _EQUAL_M = 1e-9  # both sides of (22) agree where the centre is moved to within 
     "eq. (22), section 5.2",
     "the centre differs by {distance} mm at λ = {shares}{order}; the translation is {angle:.1f}° "
     "from the axis of the turn",
-    "equal to round-off; to first order only where the difference is ∝ λ²",
+    "equal to round-off; to first order only if the difference is ∝ λ²",
     lambda n: n.largest <= _EQUAL_M,
 )
 def _equation_22(subject: _Subject) -> Iterator[Numbers]:
-    """How far both sides of [RH00] eq. (22) are apart at shares of the task, and to which order."""
+    """Differences of both sides of [RH00] eq. (22) at shares of the task, and their order."""
     if subject.composition is None:
         return
     lambdas, distance, angle, _ = subject.composition
@@ -692,14 +692,14 @@ def claims_of(report_data: ReportData, composition: Composition | None) -> list[
     """All claims that this run can speak about, in the order of the paper.
 
     report_data : records, truth and extra runs.
-    composition : of the parts of the task; None where it could not be computed.
+    composition : of the parts of the task; None if it could not be computed.
     """
     subject = _Subject(report_data, composition)
     claims, studies = [*_RUNS.judged(subject)], report_data.studies
     if studies is not None and all(trace.steps for trace in studies.own.values()):  # a start off the goal
         if np.isfinite(subject.drift).all():  # else the goal pose is unknown
-            told = "the joints carry the centre straight, within {:.1g} mm: there is no drift"
-            unknown = told.format(subject.drift[:, 0].max()) if _still(subject) else ""
+            no_drift = "the joints carry the centre straight, within {:.1g} mm: there is no drift"
+            unknown = no_drift.format(subject.drift[:, 0].max()) if _still(subject) else ""
             claims += [*_DRIFT.judged(subject, unknown), *_CURES.judged(subject)]
         claims += _CONTROL.judged(subject)
     return [*claims, *_EQUATION.judged(subject)]

@@ -43,7 +43,7 @@ DIRECT = ("direct_three", "direct_two")
 
 
 def title(name: str) -> str:
-    """Name of a run as the figures write it: that of its law, and whether it follows the plan."""
+    """Name of a run as the figures write it: the name of its law, and whether it follows the plan."""
     *step, run = name.split("/")
     law, mode = law_and_mode(run)
     follows = {TRACK: ", following the plan", IMAGE_TRACK: ", following planned images"}
@@ -65,7 +65,7 @@ class Studies:
     own: Mapping[tuple[str, str, bool], Trace]  # runs with the configured gains by (law, operators, limited)
     rate: Mapping[tuple[str, float], Trace]  # runs with true operators by (law, period)
     # directTHREE ``fast``, 0.9 of the translation a step with true operators, and ``tracked``, along the plan
-    # with calibrated ones, within the limit, where it can be followed
+    # with calibrated ones, within the limit, if it can be followed
     further: Mapping[str, Trace]
 
 
@@ -83,9 +83,9 @@ class Fit:
     """Data of the figures of a calibration; a recorded run may have no more."""
 
     calibration: Calibration  # the calibration
-    observation: Observation  # of the calibration
+    observation: Observation  # observation of the calibration
     held_out: CrossValidation | None = field(default=None, kw_only=True)  # its cross-validation, if any
-    metric: Metric | None = field(default=None, kw_only=True)  # in metres; None where it cannot be had
+    metric: Metric | None = field(default=None, kw_only=True)  # metric in metres; None if unknown
     no_metric: str = field(default="", kw_only=True)  # why not
 
     @property
@@ -98,7 +98,7 @@ class Fit:
 class Driven(Fit):
     """The runs of a robot of which no model is known, nor of its cameras; or of a sequence."""
 
-    plan: Plan  # the plan, of a sequence that of its last motion
+    plan: Plan  # the plan; for a sequence, of its last motion
     traces: Mapping[str, Trace]  # runs of the laws by name
     lacks: str = "no model of robot and cameras is known that could be drawn: set robot, rig and markers"
 
@@ -113,10 +113,10 @@ class ReportData(Fit):
     plan: Plan  # the plan
     numbers: tuple[int, ...]  # numbers of the face markers
     traces: Mapping[str, Trace] = field(default_factory=dict)  # runs of the laws by name
-    studies: Studies | None = None  # extra runs; None where they could not be made
+    studies: Studies | None = None  # extra runs; None if they could not be made
     no_studies: str = ""  # why not
     trajectory: Trajectory = field(kw_only=True)  # requested motion of the plan
-    stall_periods: int = 20  # steps in which the error of a run that stands still falls by less than 1 %
+    stall_periods: int = 20  # steps in which the error of a stalled run falls by less than 1 %
 
     def compared(self) -> list[str]:
         """Names of the runs of laws that follow the plan, each after that in which the law regulates."""
@@ -132,7 +132,7 @@ class ReportData(Fit):
 
     @property
     def extra(self) -> Studies:
-        """The extra runs, for figures that are drawn only where there are some."""
+        """The extra runs, for figures that are drawn only if there are some."""
         assert self.studies is not None
         return self.studies
 
@@ -143,7 +143,7 @@ class ReportData(Fit):
         return np.asarray(M.mean(axis=0) if self.plant.center < 0 else M[self.plant.center])
 
     def goal_center(self, trace: Trace) -> FloatArray:
-        """True centre (3,) of the face before the cameras at the goal, m; NaN where its pose is unknown."""
+        """True centre (3,) of the face before the cameras at the goal, m; NaN if its pose is unknown."""
         before, after = self.robot.base_tool, trace.goal_pose
         if self.plant.model.on_tool:  # from which the face moves the other way
             before, after = after, before
@@ -168,22 +168,22 @@ def moved(report_data: Driven | ReportData) -> list[str]:
 class FigureSpec:
     """One figure and its requirements."""
 
-    name: str  # of its files
+    name: str  # stem of its files
     title: str  # title, in a phrase
     paper: str  # the figure of the paper it follows, and its section
-    data: Callable[[Any], Data]  # from a ``Material``; from a ``Fit`` where it needs no task
+    data: Callable[[Any], Data]  # from a ``Material``; from a ``Fit`` if it needs no task
     draw: Callable[[Data, "Figure"], None]
     height: float = 4.0  # inches; a drawing may choose another
-    alt: str = ""  # what can be seen, for those who do not see it; by default the title
+    alt: str = ""  # description for readers who cannot see it; by default the title
     laws: tuple[str, ...] = ()  # whose traces it shows: all of them, or any of them where ``any_law`` is set
     any_law: bool = False
     studies: bool = False  # whether it shows the extra runs
     shares: bool = False  # whether it shows shares of translation and rotations
     modes: bool = False  # whether it compares runs that follow the plan with others
     goal: bool = False  # whether it needs a known goal pose
-    # Whether a run has what is not in every run and is shown here, and why else the figure is left out.
+    # Whether a run has the optional data that is shown here, and otherwise the reason to omit the figure.
     shows: tuple[Callable[[Any], bool], str] | None = None
-    task: bool = True  # whether it needs a task; else a calibration with its observations is enough
+    task: bool = True  # whether it needs a task; otherwise a calibration with its observations is enough
     metric: bool = False  # whether it needs the calibration in metres
 
     @property
@@ -195,7 +195,7 @@ class FigureSpec:
 
     @property
     def optional(self) -> bool:
-        """Whether it is left out without a word where a run has nothing to show in it."""
+        """Whether it is left out without a word if a run has nothing to show in it."""
         return self.shows is not None
 
     def drawn(self, data: Data) -> "Figure":
@@ -251,7 +251,7 @@ _Draw = Callable[[Data, "Figure"], None]
 def registered(
     name: str, title: str, paper: str, data: Callable[[Any], Data], **needs: Any
 ) -> Callable[[_Draw], _Draw]:
-    """Decorator that registers a drawing function as a figure; arguments are those of ``FigureSpec``."""
+    """Decorator that registers a drawing function as a figure; arguments as of ``FigureSpec``."""
 
     def register(draw: _Draw) -> _Draw:
         REGISTER[name] = FigureSpec(name, title, paper, data, draw, **needs)
@@ -261,7 +261,7 @@ def registered(
 
 
 def percent(values: FloatArray) -> FloatArray:
-    """Values normalised to 100 at their start; NaN throughout where they start at 0."""
+    """Values normalised to 100 at their start; NaN throughout if they start at 0."""
     return np.asarray(100.0 * values / values[0]) if values[0] != 0 else np.full_like(values, np.nan)
 
 
@@ -271,7 +271,7 @@ def joint_units(prismatic: BoolArray) -> FloatArray:
 
 
 def joint_kinds(prismatic: BoolArray) -> list[tuple[list[int], str]]:
-    """Numbers of the revolute and of the prismatic joints, where there are some, with their unit."""
+    """Numbers of the revolute and of the prismatic joints, if there are some, with their unit."""
     kinds = [(np.flatnonzero(prismatic == kind).tolist(), "mm" if kind else "deg") for kind in (False, True)]
     return [(numbers, unit) for numbers, unit in kinds if numbers]
 

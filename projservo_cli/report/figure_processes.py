@@ -31,8 +31,8 @@ class Drawing(NamedTuple):
 class SecondProcess:
     """A process that draws from the end of a list, while this one draws from its beginning.
 
-    It takes a second to begin, so it is started before the data of the figures are there. What it does not
-    do, or cannot, this process does.
+    It takes a second to begin, so it is started before the data of the figures are there. Any that it does
+    not do, or cannot, this process does.
 
     useful : whether there will be many figures.
     """
@@ -45,10 +45,10 @@ class SecondProcess:
         self._working = False
 
     def __enter__(self) -> "SecondProcess":
-        """Start the process, where it is useful and there is a processor for it."""
+        """Start the process, if it is useful and there is a processor for it."""
         if self._useful:
             command = [sys.executable, "-c", f"import {__name__} as drawing; drawing.serve()"]
-            with suppress(OSError):  # of a system that starts no more processes
+            with suppress(OSError):  # the system starts no more processes
                 self._process = Popen(command, stdin=PIPE, stdout=PIPE, stderr=DEVNULL)
         return self
 
@@ -66,7 +66,7 @@ class SecondProcess:
             Thread(target=self._receive, args=(self._process, drawings), daemon=True).start()
         for i, drawing in enumerate(drawings):
             with self._changed:
-                # A figure that the other process has begun is waited for, but not its first one.
+                # A figure that the other process has begun is awaited, but not its first one.
                 while self._working and self._drawn and i == len(drawings) - len(self._drawn) - 1:
                     self._changed.wait()
                 done = self._drawn.get(i)

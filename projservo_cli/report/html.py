@@ -14,7 +14,7 @@ from projservo_cli.report.style import power_of_ten
 if TYPE_CHECKING:
     from jinja2 import Environment
 
-_NONE = "\N{EN DASH}"  # in place of a number that is not there
+_NONE = "\N{EN DASH}"  # replaces a missing number
 
 
 def html_page(template: str, **values: Any) -> str:
@@ -48,7 +48,7 @@ def embedded(content: bytes, media_type: str) -> str:
 
 
 def short(value: float | None, digits: int = 3) -> str:
-    """A number with few digits, powers of ten set as such; a dash where there is none."""
+    """A number with few digits, powers of ten set as such; a dash if there is none."""
     if value is None or not math.isfinite(value):
         return _NONE
     power = math.floor(math.log10(abs(value))) if value else 0

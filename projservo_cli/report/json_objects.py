@@ -15,9 +15,9 @@ from projservo_cli.records import WHY_LOST, Calibration, CarriedByObject, Trace,
 from projservo_cli.report.figure_inputs import PAGE_FILE
 from projservo_cli.store.run_file import Run
 
-# Names of the constraints whose smallest values along the planned motion are told.
+# Names of the constraints whose smallest values along the planned motion are reported.
 NEAREST = tuple(CONSTRAINTS[constraint].value for constraint in OF_MOTION)
-# Lists of what does not fit: observations, and deviations from the model.
+# Lists of misfits: observations, and deviations from the model.
 _LISTS = (
     *("outliers", "suspect_joint_readings", "id_switches", "moved_images", "turned_images"),
     *("model_errors", "refits"),
@@ -38,7 +38,7 @@ _SHORT_ARRAYS = (
 def stage_object(stage: str, run: Run, names: Sequence[str | None], laws: Sequence[str]) -> dict[str, Any]:
     """The JSON object of a stage that was made or is up to date.
 
-    names : of the joints as far as somebody gave them some; laws : names of their runs.
+    names : of the joints, if they have any; laws : names of their runs.
     """
     path = {"run": run.path.resolve()}
     if stage == "calibrate":

@@ -77,12 +77,12 @@ def _law_words(trace: Mapping[str, Any]) -> str:
 
 
 _SECTIONS = ("calibration", "metric", "plan", "control")
-_MOST_BYTES = 20_000_000  # of a file; figures have some 100,000
+_MOST_BYTES = 20_000_000  # limit of a file; figures have about 100,000
 _TYPES = {"svg": "image/svg+xml", "png": "image/png"}  # that a page can show, the best first
 
 
 class _Picture(NamedTuple):
-    """One figure, and the (label, path) of its files; no drawing where there is no file a page can show."""
+    """One figure, and the (label, path) of its files; no drawing if there is no file a page can show."""
 
     anchor: str  # its name within the page
     number: str  # as in the names of its files
@@ -110,7 +110,7 @@ def _pictures(directory: Path, files: Sequence[str], folder: str, prefix: str) -
 
 
 def _drawing(path: Path, kind: str) -> str | None:
-    """Address of a figure within the page; None where there is no file in the folder of the run."""
+    """Address of a figure within the page; None if there is no file in the folder of the run."""
     try:
         content = path.read_bytes() if lies_inside(path, path.parents[1]) else None
     except OSError:
@@ -161,7 +161,7 @@ def _view(run: Run, about: About, *, folder: str = "", prefix: str = "") -> dict
 
 
 def _made(run: Run, about: About) -> Iterator[tuple[str, str]]:
-    """Return the provenance of a run; a value that stages differ in stands with its stages."""
+    """Return the provenance of a run; a value that differs between stages is listed with its stages."""
     yield "configuration", f"{about.name}, {'recorded' if about.recorded else 'simulated'}"
     yield "seed", str(about.seed)
     inputs = {key: text for result in run.results.values() for key, text in result.inputs.items()}
@@ -177,7 +177,7 @@ def _made(run: Run, about: About) -> Iterator[tuple[str, str]]:
 
 
 def _provenance_text(key: str, provenance: Mapping[str, Any]) -> str:
-    """One property of the origin of a result, in words; the versions where there is no key."""
+    """One property of the origin of a result, in words; the versions if there is no key."""
     if not key:
         return ", ".join(
             f"{package} {provenance[package]}" for package in _VERSIONS if provenance.get(package)
@@ -237,7 +237,7 @@ def _drift(report: Report) -> dict[str, Any] | None:
 
 
 def _differences(settings: Sequence[Mapping[str, Any]]) -> list[tuple[str, list[str]]]:
-    """Settings in which runs differ: the key, and what each run has; empty where it lacks the key."""
+    """Settings in which runs differ: the key, and the value of each run; empty if it lacks the key."""
     flat = [dict(_leaves("", of_run)) for of_run in settings]
     keys = dict.fromkeys(key for of_run in flat for key in of_run)
     rows = [(key, [of_run.get(key, "") for of_run in flat]) for key in keys]

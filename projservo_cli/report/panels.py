@@ -16,7 +16,7 @@ PATH = style.line(style.GREY, width=0.8, label="path of a marker")
 def rows(
     figure: "style.Figure", counts: Sequence[int], heights: Sequence[float] | None = None
 ) -> list[list["style.Axes"]]:
-    """Rows of panels, so many in each of them, of one width in a row and of relative heights."""
+    """Rows of panels, with given numbers of panels, of one width in a row and of relative heights."""
     grid = figure.add_gridspec(len(counts), math.lcm(*counts), height_ratios=heights)
     parts = [np.split(np.arange(grid.ncols), count) for count in counts]
     return [
@@ -30,7 +30,7 @@ class DrawnRun(NamedTuple):
 
     s: FloatArray  # (k, V, m, 2) markers in cyclic order, px
     line: style.LineStyle
-    hidden: BoolArray | None = None  # (k, V) whether the face is hidden, where that is to be shown
+    hidden: BoolArray | None = None  # (k, V) whether the face is hidden, if that is to be shown
 
 
 def images(row: Sequence["style.Axes"], runs: Sequence[DrawnRun], s_star: FloatArray) -> None:
@@ -82,12 +82,12 @@ Curve = tuple[
 ]  # abscissa (k,), values (k,), and their style
 
 
-def errors(axes: "style.Axes", curves: Iterable[Curve], least: float = 0.0, **names: str) -> None:
-    """Draw errors over time on a logarithmic scale, those below the least at it.
+def errors(axes: "style.Axes", curves: Iterable[Curve], floor: float = 0.0, **names: str) -> None:
+    """Draw errors over time on a logarithmic scale, smaller ones at ``floor``.
 
     names : of the abscissa and the ordinate.
     """
     for t, values, line in curves:
-        axes.plot(t, np.maximum(values, least), **line)
+        axes.plot(t, np.maximum(values, floor), **line)
     style.log_scale(axes)
     axes.set(**{"xlabel": "time (s)"} | names)

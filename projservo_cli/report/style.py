@@ -29,7 +29,7 @@ _IMAGE = "image"  # label of axes that show pixels
 # M. Okabe, K. Ito, "Color Universal Design", 2008; ordered so that neighbours differ in lightness.
 BLACK, ORANGE, BLUE, SKY = "#000000", "#E69F00", "#0072B2", "#56B4E9"
 VERMILION, GREEN, PURPLE = "#D55E00", "#009E73", "#CC79A7"
-# Of further cameras: the other colours have their meaning in the same figures.
+# Colours of further cameras: the other ones have their meaning in the same figures.
 _BROWN, VIOLET = "#7F4F24", "#5E3C99"
 GREY, PALE = "#999999", "#DDDDDD"
 SOLID, NO_LINE = "-", "none"
@@ -42,7 +42,7 @@ _CURVES: tuple[tuple[str, Any, str], ...] = (
     (ORANGE, DASH_DOTTED, "D"),
     (GREEN, (0, (3, 3)), "v"),
     (PURPLE, (0, (3, 1, 1, 1, 1, 1)), "P"),
-    (SKY, (0, (8, 2)), "X"),  # of the seventh joint
+    (SKY, (0, (8, 2)), "X"),  # style of the seventh joint
 )
 
 
@@ -158,7 +158,7 @@ def _arrange(figure: "Figure") -> None:
     share, edges = 1.0 - legend / height, figure.subplotpars
     if legend:
         figure.subplots_adjust(bottom=1.0 - share * (1.0 - edges.bottom), top=1.0 - share * (1.0 - edges.top))
-    if images:  # the last tick of an image, set when its scales are, may stand at the very edge
+    if images:  # the last tick of an image, set when its scales are, may lie at the very edge
         figure.subplots_adjust(right=min(edges.right, 1.0 - _HALF_LABEL / figure.get_figwidth()))
     for axes in images:
         axes.apply_aspect()
@@ -166,7 +166,7 @@ def _arrange(figure: "Figure") -> None:
 
 
 def _name_ordinates_once(figure: "Figure") -> None:
-    """Leave the name of an ordinate to the first of more than two panels in a row, which stand closer."""
+    """Leave the name of an ordinate to the first of more than two panels in a row, which are closer."""
     named: dict[Any, list[Axes]] = {}
     for axes in figure.axes:
         if (place := axes.get_subplotspec()) is not None:
@@ -250,7 +250,7 @@ def zero_line(axes: "Axes") -> None:
 def image_axes(axes: "Axes", pixels: FloatArray | None = None, margin: float = 0.06) -> None:
     """Axes of an image, v down, that widen to fill their panel.
 
-    They show all pixels (…, 2), by default all that is drawn so far, with a margin.
+    They show all pixels (…, 2), by default all drawn ones, with a margin.
     """
     axes.set(xlabel="u (px)", ylabel="v (px)", label=_IMAGE)
     points = axes.dataLim.get_points() if pixels is None else pixels.reshape(-1, 2)
@@ -271,7 +271,7 @@ def aspect(pixels: FloatArray, lower: float = 0.3, upper: float = 1.1) -> float:
 def log_scale(axes: "Axes") -> None:
     """Logarithmic vertical scale with plain powers of ten as labels, about five of them.
 
-    Where it shows fewer than two of them, there are numbers between, in half a decade at each tick. Values
+    If it shows fewer than two of them, there are numbers between, in half a decade at each tick. Values
     of which none is positive keep their scale.
     """
     from matplotlib.ticker import FuncFormatter, LogLocator

@@ -1,1 +1,1 @@
-"""Robots of the contract: true ones and rigs, simulated ones, and those of users."""
+"""Robots of the contract: true ones and rigs, simulated ones, and robots of users."""

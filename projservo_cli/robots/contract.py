@@ -34,8 +34,8 @@ STOP_S = 10.0
 # Share of a bound by which rounding may exceed it, and of a period by which an instant may be missed: the
 # time steps of a simulator seldom end where a command is due.
 _ROUND_OFF, _LATE = 1e-9, 0.1
-# A joint that is driven goes from reading to reading at so many times its speed limit, and by so much more
-# (rad or m), at most: one that falls or is pushed goes farther, or one whose reading is wrong.
+# A joint that is driven goes from reading to reading at this multiple of its speed limit, plus a margin
+# (rad or m), at most: a joint that falls or is pushed goes farther, or one whose reading is wrong.
 _SURGE, _LEAP = 3.0, 0.05
 _WHOLE = 8  # readings in a row whose stamps are whole seconds by chance, at most
 
@@ -48,9 +48,10 @@ class Reading(NamedTuple):
 
     q: FloatArray  # (n,) rad or m
     s: FloatArray  # (V, m, 2) px, NaN in both coordinates where unseen
-    t_q: float  # when the joints were read, s: the robot's stamp, else its clock just before it was asked
-    t_view: FloatArray  # (V,) stamps of the frames, s, by whatever clock; NaN where there are none
-    sigma_px: FloatArray | None  # (V, m) standard deviation of each corner, px; None where none is stated
+    # when the joints were read, s: the robot's stamp, otherwise its clock just before it was asked
+    t_q: float
+    t_view: FloatArray  # (V,) stamps of the frames, s, by any clock; NaN if there are none
+    sigma_px: FloatArray | None  # (V, m) standard deviation of each corner, px; None if none is stated
     view: tuple[str, ...] = VIEWS  # names of the views
     # (V, k, 2) px of the markers of objects, and (V, k) deviations of these if stated, likewise
     s_objects: FloatArray = _NO_OBJECTS
@@ -58,7 +59,7 @@ class Reading(NamedTuple):
 
     @property
     def whole(self) -> "Reading":
-        """The reading with the markers of objects after those of the tool."""
+        """The reading with the markers of objects after the markers of the tool."""
         if not self.s_objects.size:
             return self
         s, sigma = np.concatenate([self.s, self.s_objects], axis=1), None
@@ -80,9 +81,9 @@ class Bounds(NamedTuple):
     ``units`` are those in which messages give joints: deg, rad or m; empty where unknown.
     """
 
-    limits: JointLimits  # of speed with the factor of every command
-    lead: FloatArray  # of a set-point before the last reading
-    period: float  # of the loop, s
+    limits: JointLimits  # speed limits with the factor of every command
+    lead: FloatArray  # lead of a set-point before the last reading
+    period: float  # period of the loop, s
     max_servo_lag_s: float  # time constant with which joints follow, s
     sag: FloatArray  # (n,) how far joints stay short under gravity
     units: tuple[str, ...] = ()
@@ -105,8 +106,8 @@ class Bounds(NamedTuple):
         step, lead = self.limits.speed * seconds, self.lead
         return {
             "set_point_ahead": (q - lead, q + lead),
-            # Back towards the reading it may jump, which shortens the path of the robot, by what a robot
-            # may be behind: a reading that is farther away is wrong.
+            # Back towards the reading it may jump, which shortens the path of the robot, by the distance that
+            # a robot may be behind: a reading that is farther away is wrong.
             "set_point_far": (
                 np.maximum(np.minimum(sent, q), sent - lead) - step,
                 np.minimum(np.maximum(sent, q), sent + lead) + step,
@@ -122,18 +123,18 @@ class Robot(Protocol):
     A class whose cameras are others than left and right names them in ``view``, such as ``("top",)``.
 
     A class may also have ``now() -> float``, its clock, s, without which ``time.monotonic`` is taken;
-    ``release()`` and ``hold()``, which let go of the arm, so that somebody can move it for ``projservo
+    ``release()`` and ``hold()``, which let go of the arm, so that a user can move it for ``projservo
     teach``, and hold it again; ``identity() -> str``, without spaces, which changes where readings mean
-    something else, such as after homing, and without which no recording holds; ``remarks() -> list[str]``,
+    other positions, such as after homing, and without which no recording holds; ``remarks() -> list[str]``,
     faults of its last images, such as darkness; ``force() -> float``, the force on the tool, N, the greatest
     since it was last asked for, which ``stop.max_force_n`` limits; and, if it is a simulator, ``truth()``,
     the pose (4, 4) of the tool in its base frame, m, or its joints (n,), for results alone. A simulator's
     time passes in ``command`` alone, which moves it to ``due``. ``act(name, value)`` is an action, such as of
     a gripper: it returns at once, perhaps with the time that it takes, s, for which the arm is held;
-    ``holding(name)`` tells whether it holds something, None where that is unknown. And ``frames``, the images
+    ``holding(name)`` tells whether it holds an object, None if that is unknown. And ``frames``, the images
     (V, height, width) of its last reading in grey, uint8, or None: a run keeps some, which the report shows.
-    A class that takes an argument ``limits`` is given those of its joints, ``JointLimits``; one with an
-    argument ``numbers`` those of all markers, in the order of its pixels.
+    A class that takes an argument ``limits`` is given the limits of its joints, ``JointLimits``; one with an
+    argument ``numbers`` the numbers of all markers, in the order of its pixels.
     """
 
     def open(self) -> None:
@@ -143,8 +144,8 @@ class Robot(Protocol):
         """Look once.
 
         Returns ``q, pixels``, perhaps ``t_q, t_left, t_right`` and ``sigma_px`` after them, each of which may
-        be None: joints (n,), rad or m; pixels (V, m, 2) of all markers in each of V views, those of the tool
-        first, then those of the objects that are configured, NaN where unseen;
+        be None: joints (n,), rad or m; pixels (V, m, 2) of all markers in each of V views, of the tool
+        first, then of the objects that are configured, NaN where unseen;
         when the joints were read, s, by the robot's clock; a stamp of each of the V images, s, by any clock;
         standard deviations (V, m) of the pixels. Or ``q, pixels`` and perhaps ``t_q`` with a mapping from
         names of views to pixels (m, 2), or to a tuple of pixels, stamp and perhaps deviations (m,): a view
@@ -160,14 +161,14 @@ class Robot(Protocol):
         """
 
     def stop(self) -> None:
-        """Come to rest; from another thread where a call has not returned in time."""
+        """Come to rest; from another thread if a call has not returned in time."""
 
     def close(self) -> None:
         """Let go of robot and cameras; the last call."""
 
 
 class PluginRobot:
-    """A robot of somebody whose answers are awaited for a time and checked, as are its commands.
+    """The user's robot, whose answers have a timeout and are checked, as are its commands.
 
     robot : an object of the contract.
     name : of it, for messages.
@@ -175,9 +176,9 @@ class PluginRobot:
     bounds : of its commands; they give the number of joints, too.
     timeout_s, open_s : most time an answer may take, s, and opening it.
     image_size : width and height of its frames, px; None for any.
-    view : names of the views that readings are to have, in this order; None for those of the robot.
-    Raises InputError where the robot has none of such a name.
-    All methods raise ``WorkFailed`` where the robot fails, is late or answers nonsense. Calls are made in one
+    view : names of the views that readings are to have, in this order; None for the robot's.
+    Raises InputError if the robot has none of such a name.
+    All methods raise ``WorkFailed`` if the robot fails, is late or answers nonsense. Calls are made in one
     separate thread, so that the loop goes on if one never returns.
     """
 
@@ -195,7 +196,8 @@ class PluginRobot:
         objects: int = 0,
     ) -> None:
         self.robot, self.name, self.bounds, self.image_size = robot, name, bounds, image_size
-        self._views: tuple[str, ...] = tuple(getattr(robot, "view", VIEWS))  # in the order of its answers
+        # views in the order of its answers
+        self._views: tuple[str, ...] = tuple(getattr(robot, "view", VIEWS))
         if isinstance(getattr(robot, "view", ()), str) or not 0 < len({*self._views}) == len(self._views):
             raise InputError(f"{name}: view is {getattr(robot, 'view', ())!r}: expected names, each once")
         self.view = self._views if view is None else tuple(view)
@@ -208,13 +210,13 @@ class PluginRobot:
         self.timeout_s, self.open_s = timeout_s, open_s
         self._joints, self._tool, self._markers = len(bounds.limits.speed), markers, markers + objects
         self._now: Callable[[], Any] = getattr(robot, "now", time.monotonic)
-        self._began = 0.0, 0.0  # what its clock showed first, and when, as below
-        self._shown = -math.inf, 0.0  # what its clock showed last, and when by that of this machine, s
+        self._began = 0.0, 0.0  # first reading of its clock, and when, as below
+        self._shown = -math.inf, 0.0  # last reading of its clock, and when by this machine's, s
         self._last: Reading | None = None
         # The clock and the stamps (1 + V,) first read, s, and how many readings in a row have whole ones.
         self._stamps: tuple[float, FloatArray, IntArray] | None = None
         self._earlier: Reading | None = None  # the one before the last
-        self.frames: ByteArray | None = None  # (V, height, width) last seen, where the robot has them
+        self.frames: ByteArray | None = None  # (V, height, width) last seen, if the robot has them
         self._sent: FloatArray | None = None  # the last set-point (n,)
         self._due = -math.inf  # when it is to be there, s
         self._orders: queue.SimpleQueue[tuple[Callable[[], Any], Future[Any]] | None] = queue.SimpleQueue()
@@ -248,10 +250,10 @@ class PluginRobot:
         self.frames = None if frames is None else frames[self._rows]
         sizes = image_sizes(self.image_size, self._views)
         if frames is not None and np.isfinite(sizes).all() and (sizes != frames.shape[:0:-1]).any():
-            shown = " x ".join(map(str, frames.shape[:0:-1]))
+            frame_size = " x ".join(map(str, frames.shape[:0:-1]))
             asked = " and ".join(dict.fromkeys(f"{width:.0f} x {height:.0f}" for width, height in sizes))
             raise WorkFailed(
-                f"{self.name}: the image size of its frames is {shown} px, not the {asked} of the "
+                f"{self.name}: the image size of its frames is {frame_size} px, not the {asked} of the "
                 "configuration; set resolution and crop of the cameras as they were calibrated with"
             )
         return self._last
@@ -261,7 +263,7 @@ class PluginRobot:
         return self._now(), self.robot.read(), getattr(self.robot, "frames", None)
 
     def now(self) -> float:
-        """Time of the clock of the robot, s; of that of this machine where it has none."""
+        """Time of the clock of the robot, s; of this machine's clock if it has none."""
         return self._time(time.monotonic() if self._now is time.monotonic else self._ask("now", self._now))
 
     def truth(self) -> FloatArray | None:
@@ -274,7 +276,7 @@ class PluginRobot:
         return self._numbers("truth() gave numbers", answer, shape, finite=True)
 
     def force(self) -> float:
-        """Force on the tool, N, as the robot reports it; raises InputError where it reports none."""
+        """Force on the tool, N, as the robot reports it; raises InputError if it reports none."""
         if not callable(method := getattr(self.robot, "force", None)):
             raise InputError(f"stop.max_force_n: {self.name} has no force(): add it, or leave the key out")
         return float(self._numbers("force() gave numbers", self._ask("force", method), (), finite=True))
@@ -301,14 +303,14 @@ class PluginRobot:
         """Have it act, if it can, and return how long that takes, s."""
         method = getattr(self.robot, "act", None)
         if not callable(method):
-            return 0.0  # of a simulated robot, which has nothing to act with
+            return 0.0  # a simulated robot has no actions
         seconds = self._ask("act", lambda: method(name, value))
         return float(self._numbers("act() gave a time", 0.0 if seconds is None else seconds, (), finite=True))
 
     def holding(self, name: str) -> bool | None:
-        """Whether what an action closed holds something; None where the robot cannot tell."""
-        held = self._optional("holding", None, name)
-        return None if held is None else bool(held)
+        """Whether the closed gripper of an action holds an object; None if the robot cannot tell."""
+        is_holding = self._optional("holding", None, name)
+        return None if is_holding is None else bool(is_holding)
 
     def _optional(self, name: str, default: Any, *given: Any) -> Any:
         """Return the answer of a method that a class may have; the default without it."""
@@ -332,9 +334,9 @@ class PluginRobot:
         return all(callable(getattr(self.robot, name, None)) for name in ("release", "hold"))
 
     def by_hand(self, what: str) -> None:
-        """``release`` the arm, so that somebody can move it, or ``hold`` it again where it is.
+        """``release`` the arm, so that a user can move it, or ``hold`` it again where it is.
 
-        Before and after ``hold`` the arm is sent where it is read to stand: one whose servos are only
+        Before and after ``hold`` the arm is sent to its joint readings: one whose servos are only
         switched on again would leap to its last set-point, from before it was released.
         """
         q = self.read().q if what == "hold" else None
@@ -343,7 +345,7 @@ class PluginRobot:
         self._stay(q)
 
     def _stay(self, q: FloatArray | None) -> None:
-        """Send joints (n,) where the robot was read to stand as its set-point, if there are any."""
+        """Send the last joint readings (n,) as its set-point, if there are any."""
         if q is not None:
             self._sent = None  # it was moved by hand since: no step leads there
             self.command(q, np.zeros_like(q), self.now() + self.bounds.period)
@@ -371,7 +373,7 @@ class PluginRobot:
         return before > due + slack
 
     def waits(self, seconds: float) -> bool:
-        """Wait so long, s; False where the clock of the robot stands still meanwhile, a simulator's."""
+        """Wait so long, s; False if the clock of the robot stops meanwhile, a simulator's."""
         if self._runs_alone is not False:
             before = self.now()
             time.sleep(seconds)
@@ -379,7 +381,7 @@ class PluginRobot:
         return self._runs_alone
 
     def stop(self) -> None:
-        """Bring the robot to rest, once: in its thread, and from another where that does not answer.
+        """Bring the robot to rest, once: in its thread, and from another if that does not answer.
 
         An impatient Ctrl-C does not cut it short.
         """
@@ -432,7 +434,7 @@ class PluginRobot:
             ) from None
         if isinstance(error, (KeyboardInterrupt, InputError)):
             raise error
-        if isinstance(error, WorkFailed):  # of a class that says it in words
+        if isinstance(error, WorkFailed):  # the class words it
             raise WorkFailed(f"{self.name}: {error}", findings=error.findings) from error
         if error is not None:
             raise WorkFailed(f"{self.name}: {what}() failed: {what_failed(error)}") from error
@@ -444,7 +446,7 @@ class PluginRobot:
         before, there = self._shown
         last = max(before + here - there, self._due) if self._shown[1] else math.inf
         if not before <= now <= last + self.timeout_s:
-            began, then = self._began  # one that ran well until now was set, whatever its unit
+            began, then = self._began  # a clock that ran well until now was set, in any unit
             unit = time_unit(max(now - began, 1e-9) / max(here - then, 1e-6))
             raise WorkFailed(
                 f"{self.name}: its clock jumped from {before:.6g} s to {now:.6g} s"
@@ -528,7 +530,7 @@ class PluginRobot:
         np.multiply(whole + 1, (times == np.rint(times)) & (times != 0.0), out=whole)
         names = "t_q", *(f"t_{view}" for view in self.view)
         for name, t, since, count in zip(names, times, first, whole, strict=True):
-            # A clock of its own may jump by a second or two, when it is set.
+            # A separate clock may jump by a second or two, when it is set.
             unit = time_unit(max(t - since - 2.0, 1e-9) / (clock - begun)) if clock - begun > 2e-3 else ""
             if unit:
                 raise WorkFailed(
@@ -574,9 +576,9 @@ class PluginRobot:
         return Finding(code, REFUSES, Subject(joints=(i + 1,)), amount, unit=self.bounds.unit(i), **more)
 
     def _leap(self, before: Reading | None, now: Reading, sent: FloatArray) -> Finding | None:
-        """Return which joint read what it cannot have reached since the reading before; None for none.
+        """Return the joint whose reading cannot have been reached since the reading before, or None.
 
-        Towards the set-point (n,) it may leap: a reading that stood still for a while does.
+        Towards the set-point (n,) it may leap: a reading that repeated for a while does.
         """
         if before is None:
             return None
@@ -612,7 +614,7 @@ def _difference(before: str, now: str) -> str:
 
 
 def _serve(call: Callable[[], Any], order: "Future[Any]") -> None:
-    """Make a call, unless it was cancelled, and keep what comes of it."""
+    """Make a call, unless it was cancelled, and keep its result."""
     if order.set_running_or_notify_cancel():
         try:
             order.set_result(call())

@@ -9,11 +9,11 @@ from PIL import Image
 from projservo_cli.records import ByteArray, FloatArray, RecordedFrames
 
 MOST_FRAMES = 60  # instants of a run that are kept
-_QUALITY = 85  # of JPEG
+_QUALITY = 85  # quality of JPEG
 
 
 class _Shot(NamedTuple):
-    """The frames of an instant that is kept, one a view."""
+    """The frames of an instant that is kept, one per view."""
 
     instant: int
     s: FloatArray  # (V, m, 2) px, its detections

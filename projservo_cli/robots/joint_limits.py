@@ -14,8 +14,8 @@ class Joints(NamedTuple):
     """Knowledge of the joints of a robot."""
 
     types: str  # one letter a joint, R or P
-    limits: JointLimits  # infinite where none is set; accelerations of the profile joint_space alone
-    units: tuple[str, ...]  # in which messages give readings: deg, rad or m
+    limits: JointLimits  # infinite if none is set; accelerations of the profile joint_space alone
+    units: tuple[str, ...]  # units of readings in messages: deg, rad or m
 
     def length_of(self, degrees: float) -> FloatArray:
         """An angle as (n,) rad, for prismatic joints the length, m, that makes as much of a difference."""

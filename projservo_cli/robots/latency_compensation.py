@@ -28,13 +28,13 @@ from projservo_cli.simulation.analytic_plant import Plant, observe
 
 # Markers that no detector sees at one pixel.
 _AT_ONE_PIXEL = 3
-# Weight in the fit of a law that a sighting keeps which is off by itself.
+# Weight in the fit of a law of a detection that is a single outlier.
 _REJECTED = 1e-3
-# A held arm that so long shows the same image to the bit, s, shows no other: a simulated one without noise.
+# Time, s, after which an image that repeats to the bit will not change: a simulated one without noise.
 _STALE_S = 0.5
 # Looks before the first motion, until enough agree or a fault is named.
 _MOST_LOOKS = 120
-# Looks over which what is wrong with images must last while the arm is held: a hand passes in less.
+# Frames over which an error of images must last while the arm is held: a hand passes in less.
 _LASTS = 60
 
 
@@ -44,12 +44,12 @@ class Known(NamedTuple):
     # pixels (k, V, m, 2) of the markers of the calibration at joints (k, n), rad or m
     predicted: Callable[[FloatArray], FloatArray]
     visible: IntArray  # (k,) markers of the loop, by their places in the observations, the face first
-    order: IntArray  # (m,) index there of each marker of the calibration, −1 where it is not observed
+    order: IntArray  # (m,) index there of each marker of the calibration, −1 if it is not observed
     sigma_px: float  # noise of the pixels
     sigma_scale: float  # noise of a pixel over the deviation that it states
-    sigma_q: FloatArray  # (n,) deviation of joint readings, rad or m; 0 where none shows
+    sigma_q: FloatArray  # (n,) deviation of joint readings, rad or m; 0 if none shows
     delays: DelayPrior
-    timeout_s: float  # longest that an image may stand still while joints move, s
+    timeout_s: float  # longest that an image may stay the same while joints move, s
     max_force_n: float | None = None  # on the tool, N; None for any
 
 
@@ -68,8 +68,8 @@ class DrivenRobot:
     watch : over the object that carries the goal; None without one.
     ``q``: (n,) joint readings when last asked for, or the true joints, rad or m. ``H, hidden``: displacement
     of the face and self-occlusion there. ``in_front``: a camera sees nothing behind it. ``disturbance``: why
-    the images no longer agree with the calibration, or what failed; else None. ``weight``: (V, k) of the
-    pixels shown in a fit, where the robot states their deviations. ``noise_ratio``: of what these state to
+    the images no longer agree with the calibration, or the failure; otherwise None. ``weight``: (V, k) of the
+    pixels shown in a fit, if the robot states their deviations. ``noise_ratio``: of the stated noise to
     the noise of the run; at least 1. Of each observation since ``begin``: ``delays`` of all views as
     followed, (V,) s, ``readings`` of the joints, (n,), and ``truths`` of a robot that knows them, joints (n,)
     or the pose (4, 4) of its tool; ``film`` of its frames; ``forces`` on its tool, N, if limited.
@@ -101,7 +101,7 @@ class DrivenRobot:
         self.hidden = np.zeros(V)
         self.disturbance: Finding | None = None
         self.weight: FloatArray | None = None
-        self.retreats = 0  # periods by which it goes back where the object moves
+        self.retreats = 0  # periods by which it goes back if the object moves
         self.noise_ratio = 1.0
         self._stale = 0  # looks in a row without a new frame while the arm is held
         self._dark = np.zeros(V, dtype=np.int64)  # looks in a row that show no marker of the calibration
@@ -174,14 +174,14 @@ class DrivenRobot:
         return np.ascontiguousarray(reading.s[:, visible]) + self._carried
 
     def _noise_of(self, sigma: FloatArray, s: FloatArray) -> float:
-        """Ratio of the noise that pixels (V, k, 2) of a fit state (V, k) to that of the run; at least 1."""
+        """Stated noise (V, k) of pixels (V, k, 2) of a fit, over the noise of the run; at least 1."""
         information = np.maximum(sigma[np.isfinite(s[..., 0])], MIN_SIGMA) ** -2.0
         if not information.size or not self.known.sigma_px > 0.0:
             return 1.0
         return max(1.0, self.known.sigma_scale / (self.known.sigma_px * math.sqrt(information.mean())))
 
     def _leave_out(self, rejected: BoolArray, alike: bool) -> None:
-        """Leave sightings (V, k) that are off by themselves out of the fit of the law.
+        """Leave single outliers (V, k) out of the fit of the law.
 
         alike : all others weigh the same.
         """
@@ -202,7 +202,7 @@ class DrivenRobot:
         return self.monitor is not None and self.monitor.pending
 
     def give_up(self) -> None:
-        """Set the fault as far as it is known, where there is no time for more observations."""
+        """Set the fault as far as it is known, if there is no time for more observations."""
         if self.monitor is not None:
             self.disturbance = self.disturbance or self.monitor.give_up()
 
@@ -212,13 +212,13 @@ class DrivenRobot:
         return any(watch.moved is not None and self.disturbance == watch.moved for watch in self.watches)
 
     def _retreat(self) -> None:
-        """Go back the way that it came, by the last joint readings of the run."""
+        """Go back along its path, by the last joint readings of the run."""
         for q in self.readings[-2 : -2 - self.retreats : -1]:
             self.steered.command(q - self.steered.target, self.robot.bounds.period)
             self.steered.observe()
 
     def fits(self) -> Finding | None:
-        """Return the fault that images show where the robot stands; None where enough of them agree.
+        """Return the fault that images show where the robot is; None if enough of them agree.
 
         Nothing is moved meanwhile.
         """
@@ -239,34 +239,34 @@ class DrivenRobot:
             self.give_up()
         return self.disturbance
 
-    def unseen(self, seeing: int, *, held: bool = False) -> Finding | None:
-        """Return the cameras that show no marker of the calibration, unless so many others do; else None.
+    def unseen(self, seeing: int, *, wait: bool = False) -> Finding | None:
+        """Return the cameras that show no calibrated marker, or None if ``seeing`` others do.
 
         seeing : number of cameras, at most all of them.
-        held : whether the arm may be held meanwhile, to see whether that lasts.
+        wait : whether to hold the arm meanwhile, to see whether the fault lasts.
         """
-        if held:
+        if wait:
             self._persists(lambda: bool(max(self._dark) >= WINDOW), _LASTS)
         views = self.robot.view
-        dark = [view for view, looks in zip(views, self._dark, strict=True) if looks >= WINDOW]
+        dark = [view for view, n_frames in zip(views, self._dark, strict=True) if n_frames >= WINDOW]
         if len(views) - len(dark) >= min(seeing, len(views)):
             return None
         return Finding("unseen_markers", LIMITS, Subject(views=tuple(dark)))
 
-    def at_rest(self, *, held: bool = False) -> Finding | None:
-        """Return the fault that images of one posture show, as ``fault_at_rest`` tells it; else None.
+    def at_rest(self, *, wait: bool = False) -> Finding | None:
+        """Return the fault that images of one posture show, as ``fault_at_rest`` returns it; otherwise None.
 
-        held : whether the arm may be held meanwhile, to see whether that lasts.
+        wait : whether to hold the arm meanwhile, to see whether the fault lasts.
         """
         if (monitor := self.monitor) is not None:
-            if held:
+            if wait:
                 self._persists(lambda: bool(fault_of_mean(monitor)), _LASTS)
             self.disturbance = self.disturbance or fault_of_mean(monitor)
         return self.disturbance
 
-    def _persists(self, wrong: Callable[[], bool], looks: int) -> bool:
-        """Hold the arm while something is wrong with images; whether it lasted for all of some looks."""
-        for _ in range(looks):
+    def _persists(self, wrong: Callable[[], bool], n_frames: int) -> bool:
+        """Hold the arm while images are wrong; whether that lasted for all of a number of frames."""
+        for _ in range(n_frames):
             if self.disturbance or not wrong():
                 return False
             self.steered.hold()
@@ -293,9 +293,9 @@ class DrivenRobot:
         return math.sqrt(2.0 * float(np.mean(known**2))) if known.size else math.nan
 
     def settled(self, within_px: float) -> bool:
-        """Whether the arm stands, by images within a number of px rms or by its readings.
+        """Whether the arm is at rest, by images within a number of px rms or by its readings.
 
-        Not before images of where it stands agree with the calibration.
+        Not before images of its pose agree with the calibration.
         """
         if self.monitor is not None and (self.pending or self.monitor.agreeing < WINDOW):
             return False

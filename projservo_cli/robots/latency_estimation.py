@@ -2,7 +2,7 @@
 
 The delay of a view is the instant of a joint reading less the middle of the exposure of the image that came
 with it. Only this difference can be seen, so a constant offset is always estimated: of the stamp of a frame
-where it has one, which may be of another clock or of its arrival, else of the reading itself.
+if it has one, which may be of another clock or of its arrival, otherwise of the reading itself.
 """
 
 import math
@@ -14,24 +14,25 @@ import numpy as np
 from projservo_cli.calibration.time_offset import is_repeated_frame
 from projservo_cli.records import BoolArray, FloatArray, WorkFailed
 
-# Deviation of an unknown delay, and of a single frame where no calibration gives it, s.
+# Deviation of an unknown delay, and of a single frame if no calibration gives it, s.
 _UNKNOWN_S, _JITTER_S = 0.3, 0.012
 # Readings that are kept, and how far beyond the last one joints are taken to move on, s.
 _KEPT, _AHEAD_S = 256, 0.1
 # Delays that are reckoned with while little is known, s.
 _DELAYS = np.arange(-0.1, 1.0, 0.01)
-# An image is compared with those predicted so long before and after; a delay known as well is followed, s.
+# An image is compared with predictions up to this time before and after; a delay known as well is followed,
+# s.
 _APART_S = 0.02
-# Markers err alike: they count as so many coordinates. What no image excludes.
+# Markers err alike: they count as this number of coordinates. Delays that no image excludes.
 _COUNTED, _LEAST_CHANCE = 8.0, 1e-9
 # A frame farther from its instant than this number of deviations is none of this delay, nor is that number in
 # a row; the factor by which it fits better elsewhere, in squares.
 _GATE, _STRAYS, _CLEARLY = 4.0, 3, 9.0
 # Rate at which a delay may change, s for each frame that shows it; number in a row that err alike.
 _DRIFT_S, _ALIKE = 0.2e-3, 10.0
-# Error of the model at least where it gives the instant of a frame, px.
+# Error of the model at least if it gives the instant of a frame, px.
 _MODEL_PX = 0.3
-# Images should have moved so far, px, before one that stands still is a fault.
+# Motion, px, that images should show before a frozen one is a fault.
 _STILL_PX = 5.0
 
 
@@ -57,7 +58,7 @@ class History:
         return float(self._t[-1]), self._q[-1]
 
     def at(self, t: FloatArray) -> FloatArray:
-        """Joints (k, n) at instants (k,), s; those of a reading to the bit, a little beyond the last one."""
+        """Joints (k, n) at instants (k,), s; exact at readings, a little beyond the last one."""
         times, q = self._t, self._q
         if len(times) == 1:
             return np.repeat(q, len(t), axis=0)
@@ -76,12 +77,12 @@ class DelayPrior(NamedTuple):
     """Knowledge of the delays of all views before the first image."""
 
     mean: FloatArray  # (V,) s
-    sigma: FloatArray  # (V,) s, of the mean; 0 where it is given and not followed
+    sigma: FloatArray  # (V,) s, of the mean; 0 if it is given and not followed
     jitter: FloatArray  # (V,) s, deviation of single frames
 
     @classmethod
     def unknown(cls, views: int) -> "DelayPrior":
-        """Return the prior of a number of views of which nothing is known."""
+        """Return the prior of a number of views without knowledge."""
         return cls(np.zeros(views), np.full(views, _UNKNOWN_S), np.full(views, _JITTER_S))
 
 
@@ -105,8 +106,8 @@ class Delays:
     """The delays of all views, and the instants of frames.
 
     view : names of the views; predicted : pixels (k, V, m, 2) at joints (k, n).
-    prior : of the delays; sigma_px : pixel noise; timeout_s : longest that an image may stand still, s.
-    sigma_q : (n,) deviation of the joint readings, rad or m; 0 where none shows.
+    prior : of the delays; sigma_px : pixel noise; timeout_s : longest that an image may stay the same, s.
+    sigma_q : (n,) deviation of the joint readings, rad or m; 0 if none shows.
     """
 
     def __init__(
@@ -131,9 +132,9 @@ class Delays:
     def update(self, t_view: FloatArray, images: FloatArray, history: History) -> _Frames:
         """Instants of the images of an observation.
 
-        t_view : (V,) s, stamps, NaN where there are none; images : (V, m, 2) px, NaN where unseen.
-        history : of the readings, that of this observation the last.
-        Raises WorkFailed if the clock of a camera jumped, or its image stands still while the joints move.
+        t_view : (V,) s, stamps, NaN if there are none; images : (V, m, 2) px, NaN where unseen.
+        history : of the readings, the last of this observation.
+        Raises WorkFailed if the clock of a camera jumped, or its image freezes while the joints move.
         """
         if self._sigma_q.any():
             self._reckon_with_joints(history.last[1])
@@ -158,7 +159,7 @@ class _View:
     """The delay of one view, and the instants of its frames.
 
     While the joints move, an image shows when it was taken. Where little is known of the delay, the chance of
-    each is kept; else a Kalman filter follows the mean, from which single frames stray by jitter:
+    each is kept; otherwise a Kalman filter follows the mean, from which single frames stray by jitter:
     s − ŝ(t) = ṡ (t′ − t), to first order.
 
     Source: Y. Bar-Shalom, X. R. Li, T. Kirubarajan, "Estimation with Applications to Tracking and
@@ -182,7 +183,7 @@ class _View:
         self._blur = blur / blur.sum(axis=1, keepdims=True)
         self._log_chance = self._open(mean, sigma)
         self._strays = 0
-        self._stamp, self._offset = math.nan, 0.0  # of the last frame; of the clock that stamps it
+        self._stamp, self._offset = math.nan, 0.0  # stamp of the last frame; offset of its clock
         self._image: FloatArray | None = None
         self._t = -math.inf  # when the last image was taken
         self._moved_at = math.nan  # when joints began to leave it
@@ -203,11 +204,11 @@ class _View:
 
     @staticmethod
     def _open(mean: float, sigma: float) -> FloatArray | None:
-        """Logarithm of the chance of each delay where little is known; None where it need not be kept."""
+        """Logarithm of the chance of each delay where little is known; None if it need not be kept."""
         return None if sigma <= _APART_S else -0.5 * ((_DELAYS - mean) / sigma) ** 2
 
     def _nominal(self, stamp: float, t_q: float) -> float:
-        """The instant, s, that a delay is the offset of: of the stamp, else of the reading."""
+        """The instant, s, that a delay is the offset of: of the stamp, otherwise of the reading."""
         if math.isnan(stamp) or not self._follows:
             return t_q
         if math.isnan(self._stamp) and not -_AHEAD_S <= t_q - stamp + self.mean <= self._timeout_s:
@@ -233,7 +234,7 @@ class _View:
             )
 
     def _require_motion(self, history: History) -> None:
-        """Refuse an image that has stood still for too long while the joints moved."""
+        """Refuse an image that has frozen for too long while the joints moved."""
         now = history.last[0]
         here, then = self._seen(history, np.array([now, self._t]))
         if not float(np.nanmax(np.abs(here - then), initial=0.0)) > _STILL_PX:
@@ -252,7 +253,7 @@ class _View:
         return np.asarray(self._predicted(history.at(t))[:, self._view])
 
     def _misfit(self, image: FloatArray, t: FloatArray, history: History) -> FloatArray:
-        """Mean squares (k,) by which an image is off those predicted at instants (k,), px²."""
+        """Mean squares (k,) by which an image differs from predictions at instants (k,), px²."""
         off = (image - self._seen(history, t)) ** 2
         detected = np.isfinite(off)
         square = np.where(detected, off, 0.0).sum(axis=(1, 2)) / np.maximum(detected.sum(axis=(1, 2)), 1)
@@ -276,7 +277,7 @@ class _View:
         return t + float(np.clip(shift, -_APART_S, _APART_S))
 
     def _followed(self, image: FloatArray, nominal: float, history: History) -> float:
-        """Instant of a fresh image, s, by the delay so far and the image; follow the delay."""
+        """Instant of a fresh image, s, by the present delay and the image; follow the delay."""
         expected, variance = nominal - self.mean, self._variance + self._jitter**2
         shift, sigma = self._shift(image, expected, history)
         if not math.isfinite(sigma):
@@ -292,7 +293,7 @@ class _View:
         return expected + variance / (variance + sigma**2) * shift
 
     def _stray(self, image: FloatArray, nominal: float, history: History) -> None:
-        """A frame that is far from its instant is another delay's, where it clearly fits that."""
+        """A frame that is far from its instant is another delay's, if it clearly fits that."""
         here, *others = self._misfit(image, nominal - np.append(self.mean, _DELAYS), history)
         self._strays += here > _CLEARLY * max(min(others), self.error_px**2)
         if self._follows and self._strays >= _STRAYS:
@@ -302,7 +303,7 @@ class _View:
     def _shift(self, image: FloatArray, t: float, history: History) -> tuple[float, float]:
         """Return the time of an image after t, to first order, and its standard deviation, s.
 
-        An image gives its instant only where it moved in the same direction before and after.
+        An image gives its instant only if it moved in the same direction before and after.
         """
         predicted = self._seen(history, t + _APART_S * np.array([-1.0, 0.0, 1.0]))
         detected = np.isfinite(image[:, 0]) & np.isfinite(predicted[..., 0]).all(axis=0)

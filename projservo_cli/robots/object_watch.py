@@ -17,36 +17,37 @@ from projservo_cli.task.displaced_object import ALIKE_PX
 _FRAMES = WINDOW
 LOOKS = 20  # after which one view is enough: a camera that was moved has been named by then
 # Deviations of their mean beyond which it is elsewhere, and motion that counts as none, px: edges are drawn
-# as far aside by another light, or by what hides a part of a tag.
+# as far aside by another light, or by a cover of a part of a tag.
 _DEVIATIONS, _LEAST_PX = 4.0, 0.5
 _LEAST_MARKERS = 2  # seen in a view in all these frames
-# Chance by which an object that stands still has moved, and of what is left by one that did; its least
+# Chance by which an object at rest has moved, and of the residual of one that did; its least
 # motion, rms px.
 _BY_CHANCE, _UNLIKE, _LEAST_MOTION_PX = 1e-6, 1e-4, 0.25
 
 
 class ObjectWatch:
-    """Object that stands still while a robot moves, or the finding that it does not.
+    """Object that rests while a robot moves, or the finding that it does not.
 
     A marker that is hidden is where it was seen last.
 
-    name : of the object; marker : (k,) numbers of its markers, at these places (k,) among those of objects.
+    name : of the object; marker : (k,) numbers of its markers, at these places (k,) among the markers of
+    objects.
     s : (V, k, 2) px of them when the motion was planned, NaN where unseen.
-    sigma : (V, k) their deviation, NaN where it is that of a frame.
+    sigma : (V, k) their deviation, NaN if it is the deviation of a frame.
     by_motion : (V, k, 2, g) derivatives of them by displacements of the object.
-    ``moved``: that it has, and by how much; None where it has not.
+    ``moved``: that it has, and by how much; None if it has not.
     """
 
     def __init__(
         self,
         name: str,
         marker: Sequence[int],
-        places: IntArray,
+        indices: IntArray,
         s: FloatArray,
         sigma: FloatArray,
         by_motion: FloatArray,
     ) -> None:
-        self.name, self._marker, self._places = name, marker, places
+        self.name, self._marker, self._places = name, marker, indices
         self._planned, self._sigma, self._by_motion, self._looks = s, sigma, by_motion, 0
         self.moved: Finding | None = None
         self._frames: list[deque[FloatArray]] = [deque(maxlen=_FRAMES) for _ in s]
@@ -69,15 +70,15 @@ class ObjectWatch:
             seen = np.isfinite(by[:, 0])
             if len(frames) < _FRAMES or seen.sum() < _LEAST_MARKERS:
                 continue
-            # By the scatter of the frames, with that of the plan, which may be of one.
+            # The scatter of the frames, with the plan's, which may be of one frame.
             sigma = math.sqrt(float(np.var(np.array(frames)[:, seen], axis=0, ddof=1).mean()))
             away[view], scatter[view] = by, sigma
             shown.append(view)
-            most = max(_LEAST_PX, _DEVIATIONS * sigma * math.sqrt(1.0 + 1.0 / _FRAMES))
-            off.append(bool((px := float(np.median(np.linalg.norm(by[seen], axis=1)))) > most))
+            max_px = max(_LEAST_PX, _DEVIATIONS * sigma * math.sqrt(1.0 + 1.0 / _FRAMES))
+            off.append(bool((px := float(np.median(np.linalg.norm(by[seen], axis=1)))) > max_px))
             if off[-1]:
                 of = Subject(views=(reading.view[view],), markers=tuple(self._marker), name=self.name)
-                found = Finding("moved_object", REFUSES, of, px, limit=most, unit="px")
+                found = Finding("moved_object", REFUSES, of, px, limit=max_px, unit="px")
         if (px := self._displaced_px(away, scatter)) > _LEAST_MOTION_PX:
             of = Subject(
                 views=tuple(reading.view[v] for v in shown), markers=tuple(self._marker), name=self.name
@@ -92,7 +93,7 @@ class ObjectWatch:
     def _displaced_px(self, away: FloatArray, scatter: FloatArray) -> float:
         """Motion of the images, rms px, by the displacement that explains how far they are away (V, k, 2).
 
-        Zero within chance, and where a displacement leaves more than chance, as of light, of what hides a
+        Zero within chance, and if a displacement leaves more than chance, as of light, of a cover of a
         part, or of one camera that moved. scatter : (V,) deviation of a frame, px.
         """
         seen = np.isfinite(away[..., 0]) & np.isfinite(self._by_motion[..., 0, 0])

@@ -1,4 +1,4 @@
-"""Pacing of set-points: one absolute set-point a period, within limits, and lag and sag of servos."""
+"""Pacing of set-points: one absolute set-point per period, within limits, and lag and sag of servos."""
 
 import math
 
@@ -27,7 +27,7 @@ class SetPoint:
         self._bounds, self.target, self._answered = bounds, q.copy(), q.copy()
         self.short: BoolArray = np.zeros(len(q), dtype=np.bool_)
         self._q, self._sag = q.copy(), np.zeros(len(q))
-        self._behind = np.zeros(len(q))  # by how much a servo of that lag would be
+        self._behind = np.zeros(len(q))  # lag of a servo with this time constant
 
     @property
     def at_rest(self) -> FloatArray:
@@ -40,7 +40,7 @@ class SetPoint:
         return self.target - self._answered
 
     def read(self, q: FloatArray, seconds: float) -> None:
-        """Learn the sag from a reading (n,), so long after the last one: only while hardly anything moves."""
+        """Learn the sag from a reading (n,), some time after the last one, only if hardly any joint moves."""
         self._answered = np.where(q != self._q, self.target, self._answered)
         self._q = q.copy()
         weight = 1.0 / (1.0 + (self._behind / (_STILL * self._bounds.sag)) ** 2)
@@ -64,13 +64,13 @@ class SetPoint:
 
 
 class Steered:
-    """A robot that is sent absolute set-points, the sum of the steps asked for, one a period.
+    """A robot that is sent absolute set-points, the sum of the steps asked for, one per period.
 
     The robot itself accumulates nothing.
 
     robot : of the contract.
     ``reading``: the last one. ``history``: joint readings of all observations. ``set_point``: its
-    target, at first where it is read to stand. ``overruns``: periods that reading and computing did not fit.
+    target, at first its joint readings. ``overruns``: periods that reading and computing did not fit.
     """
 
     reading: Reading

@@ -14,11 +14,11 @@ from projservo_cli.robots.pacing import Steered
 
 
 class Session:
-    """A connection that is stopped and closed on every way out of its block; what was acted stays.
+    """A connection that is always stopped and closed at the end of its block; effects of actions stay.
 
     ``robot``: that was opened, None before. ``steered``: its set-points. ``acted``: values that actions of it
-    were sent last, by their names. ``at``: the watch over the object at whose goal the arm stands, None
-    elsewhere. ``held``: names of objects that the tool took with an action, by that of the action.
+    were sent last, by their names. ``at``: the watch over the object at whose goal the arm is, None
+    elsewhere. ``held``: names of objects that the tool took with an action, by the name of the action.
     """
 
     def __init__(self) -> None:
@@ -44,7 +44,7 @@ class Session:
         return self.steered
 
     def reading(self) -> FloatArray:
-        """Joints (n,) where the robot stands, rad or m; nothing is moved."""
+        """Joints (n,) of the robot, rad or m; no joint is moved."""
         assert self.robot is not None
         return self.robot.read().q
 
@@ -88,12 +88,12 @@ class Session:
             )
 
     def empty(self, name: str) -> bool:
-        """Whether what an action closed holds nothing, as far as the robot can tell."""
+        """Whether a gripper closed by an action is empty, as far as the robot can tell."""
         return self.robot is not None and self.robot.holding(name) is False
 
     @property
     def lost(self) -> Finding | None:
-        """The object that the tool should hold, by what was acted, and does not; None for none."""
+        """The object that the tool should hold, by its actions, and does not; None for none."""
         for name, taken in self.held.items():
             if self.empty(name):
                 part = Finding("object", subject=Subject(name=taken))
@@ -101,7 +101,7 @@ class Session:
         return None
 
     def hold(self, seconds: float) -> None:
-        """Hold the set-point for so long, s."""
+        """Hold the set-point for a time, s."""
         if self.robot is None or self.steered is None:
             return
         end = self.robot.now() + seconds
@@ -111,5 +111,5 @@ class Session:
 
     @property
     def kept(self) -> tuple[Finding, ...]:
-        """What stays as it was sent, such as a grip."""
+        """States that stay as sent, such as a grip."""
         return tuple(Finding("stays", NOTE, Subject(name=name), at) for name, at in self.acted.items())

@@ -15,13 +15,13 @@ from projservo_cli.robots.contract import PluginRobot, Reading
 STILL, _STILL_PX = 2e-5, 0.02
 _LEAST = 6  # readings that separate noise from motion
 _PATIENCE_S = 20.0  # for a robot to come to rest where it was sent
-_WAITED = 5  # looks for each image that is wanted, where the same one comes again
+_WAITED = 5  # looks for each image that is wanted, if the same one comes again
 
 
 def at_rest(
     reading: Reading, observe: Callable[[], Reading], settle_s: float, what: str
 ) -> Iterator[Reading]:
-    """Read once per period until joints and images stand still, and yield each reading."""
+    """Read once per period until joints and images are at rest, and yield each reading."""
     still, first = Standstill(settle_s), reading.t_q
     while not still.all(reading):
         if reading.t_q > first + settle_s + _PATIENCE_S:
@@ -34,41 +34,47 @@ def at_rest(
 def seen_at_rest(
     robot: PluginRobot, observe: Callable[[], Reading], frames: int, settle_s: float, what: str
 ) -> tuple[Reading, Reading, FloatArray, IntArray, list[Reading]]:
-    """Wait until a robot and its images stand still, and average frames of each view, objects included.
+    """Wait until a robot and its images are at rest, and average frames of each view, objects included.
 
     Returns the first reading at rest, the mean, deviations (V, m) of a coordinate of it, px, NaN if unknown,
     counts (V, m), and the readings that it is of.
     """
     first, reading = robot.read(), observe()
-    if reading.t_q > first.t_q:  # else it is a simulator, whose time passes in its commands alone
+    if reading.t_q > first.t_q:  # otherwise it is a simulator, whose time passes in its commands alone
         reading = [reading, *at_rest(reading, observe, settle_s, what)][-1]
-    looks = [reading]
+    every_reading = [reading]
 
-    def look() -> Reading:
-        looks.append(observe())
-        return looks[-1]
+    def next_reading() -> Reading:
+        every_reading.append(observe())
+        return every_reading[-1]
 
-    mean, squares, count = averaged(reading, look, frames)
+    mean, squares, count = averaged(reading, next_reading, frames)
     sigma = np.where(count > 1, np.sqrt(squares / np.maximum(2 * count * (count - 1), 1)), np.nan)
     sigma = sigma if mean.sigma_px is None else mean.sigma_px
-    return reading, mean, np.where(np.isfinite(mean.s[..., 0]), sigma, np.nan), count, looks
+    return reading, mean, np.where(np.isfinite(mean.s[..., 0]), sigma, np.nan), count, every_reading
 
 
-def observation_of_frames(looks: list[Reading], marker: IntArray) -> tuple[Observation, BoolArray]:
-    """Return the frames of looks at a robot at rest, and which are new (K, V).
+def observation_of_frames(every_reading: list[Reading], marker: IntArray) -> tuple[Observation, BoolArray]:
+    """Return the frames of readings of a robot at rest, and which are new (K, V).
 
     marker : (m,) numbers of the first markers, those on the tool.
     """
-    stated = [look.sigma_px[:, : len(marker)] for look in looks if look.sigma_px is not None]
+    stated = [
+        next_reading.sigma_px[:, : len(marker)]
+        for next_reading in every_reading
+        if next_reading.sigma_px is not None
+    ]
     frames = Observation(
-        pose=np.arange(len(looks)),
+        pose=np.arange(len(every_reading)),
         marker=marker,
-        q=np.array([look.q for look in looks]),
-        images=np.array([look.s[:, : len(marker)] for look in looks]),
-        sigma=np.array(stated) if len(stated) == len(looks) else None,
-        view=looks[0].view,
+        q=np.array([next_reading.q for next_reading in every_reading]),
+        images=np.array([next_reading.s[:, : len(marker)] for next_reading in every_reading]),
+        sigma=np.array(stated) if len(stated) == len(every_reading) else None,
+        view=every_reading[0].view,
     )
-    return frames, np.array([b.new_views(a) for a, b in zip([None, *looks], looks, strict=False)])
+    return frames, np.array(
+        [b.new_views(a) for a, b in zip([None, *every_reading], every_reading, strict=False)]
+    )
 
 
 def averaged(
@@ -77,8 +83,8 @@ def averaged(
     """Return the mean of readings of a robot at rest, with a number of frames of each view, each once.
 
     Frames are weighted by their deviations, if they have any. Markers that most of the frames of a view do
-    not show are NaN. Returns the mean; sums (V, m) of the squares by which pixels are off it, px²; how many
-    frames (V, m) show a marker, 0 where it is NaN.
+    not show are NaN. Returns the mean; sums (V, m) of the squares of deviations of pixels from it, px²; how
+    many frames (V, m) show a marker, 0 if it is NaN.
     """
     readings, frames = [reading], [[_frame(reading, view)] for view in range(len(reading.s))]
     for _ in range(_WAITED * wanted):
@@ -122,7 +128,7 @@ def _mean(frames: list[FloatArray]) -> tuple[FloatArray, FloatArray, FloatArray,
 
 
 class Standstill:
-    """Tells whether a robot has stood still for a time, s, by consecutive readings.
+    """Tells whether a robot has been at rest for a time, s, by consecutive readings.
 
     Over that time, and no fewer than six looks, the means of its thirds differ by no more than noise
     explains, from the differences of consecutive readings: motion adds up, noise does not.
@@ -140,7 +146,7 @@ class Standstill:
         self.moving = ""  # message on the part that moves
 
     def joints(self, reading: Reading) -> bool:
-        """Whether the joints have stood still up to the next reading."""
+        """Whether the joints have been at rest up to the next reading."""
         self._since = min(self._since, reading.t_q)
         square, variance = _drift(self._kept(self._q, reading.t_q, reading.q))
         moving = np.flatnonzero(square > np.maximum(STILL**2, 9.0 * variance))
@@ -149,7 +155,7 @@ class Standstill:
         return whole and len(self._q) >= _LEAST and not self.moving
 
     def all(self, reading: Reading) -> bool:
-        """Whether joints and images have stood still up to the next reading."""
+        """Whether joints and images have been at rest up to the next reading."""
         still = self.joints(reading)
         self._s = self._s or [deque() for _ in reading.s]
         new = reading.new_views(self._last)
@@ -177,7 +183,7 @@ _Rows = deque[tuple[float, FloatArray]]
 
 
 def _drift(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Variance of the means of the thirds of rows (k, c), and what noise makes of it, (c,)."""
+    """Variance of the means of the thirds of rows (k, c), and its expectation by noise, (c,)."""
     third = len(rows) // 3
     if third == 0:
         return np.zeros(rows.shape[1]), np.zeros(rows.shape[1])

@@ -24,7 +24,7 @@ class Refit(Section):
     table: Text = Field(description="path of the observation table, relative to the configuration")
     readings: Text | None = Field(None, description="path of a table of joints, where table lists detections")
     joint_unit: Literal["deg", "rad"] | None = Field(
-        None, description="unit of revolute joints; null: that of data"
+        None, description="unit of revolute joints; null: the unit of data"
     )
 
 
@@ -62,7 +62,7 @@ class CalibrationSettings(Section):
         None,
         ge=0,
         le=10_000,
-        description="trial poses of all joints at once, within the amplitudes, after those of single "
+        description="trial poses of all joints at once, within the amplitudes, after poses of single "
         "joints; null: 12 if readings or images may have faults, 0 for the ideal plant",
     )
     joint_noise_deg: NotNegative | None = Field(
@@ -95,5 +95,5 @@ class CalibrationSettings(Section):
 
     @property
     def joint_noise(self) -> float | None:
-        """Standard deviation of joint readings, rad; None where it is not given."""
+        """Standard deviation of joint readings, rad; None if it is not given."""
         return None if self.joint_noise_deg is None else math.radians(self.joint_noise_deg)

@@ -18,7 +18,7 @@ class Source(Section):
         description="index of a device, its path (/dev/v4l/by-path/... stays the same), a film, or a URL"
     )
     size_px: tuple[Count, Count] | None = Field(None, description="width and height; null for its own")
-    rate_hz: Positive | None = Field(None, description="frames a second; null for its own")
+    rate_hz: Positive | None = Field(None, description="frames per second; null for its default")
     fourcc: Annotated[str, StringConstraints(min_length=4, max_length=4, to_upper=True)] = Field(
         "MJPG", description="format in which a device sends frames; YUYV fills a USB 2 hub with one camera"
     )
@@ -26,7 +26,7 @@ class Source(Section):
         None, description="of a device; null leaves it to the camera"
     )
     focus: NotNegative | None = Field(
-        None, description="of a device, in units of its driver; null leaves it where it stands; no autofocus"
+        None, description="of a device, in units of its driver; null leaves it as it is; no autofocus"
     )
 
     def contradictions(self) -> Iterator[Note]:
@@ -48,7 +48,7 @@ def device_of(source: int | str) -> Path | None:
 class Cameras(ByView):
     """Cameras by name, of an arm whose class has joints() in place of read(); projservo finds the tags.
 
-    A pair is ``left`` and ``right``; any number of others have names of their own, such as ``top``.
+    A pair is ``left`` and ``right``; any number of others have other names, such as ``top``.
     """
 
     __pydantic_extra__: dict[str, Source]
@@ -68,7 +68,7 @@ class Cameras(ByView):
         for name, one in self.sources.items():
             where = device_of(one.source) or one.source
             if (other := names.setdefault(where, name)) != name:
-                what = f"is {where}, that of the {other} camera as well: name the other one"
+                what = f"is {where}, also the device of the {other} camera: name another one"
                 yield (name, "source"), what
         if self.reconnect_s < self.max_age_s:
             yield ("reconnect_s",), f"must not be below max_age_s, {self.max_age_s:g}"

@@ -27,12 +27,12 @@ def _law(name: str) -> str:
 _TARGET = {"type": "string", "pattern": plugins.TARGET}
 
 
-# A registered name is stored as the class it stands for, so that a run can be read where it is not installed.
+# A registered name is stored as its class, so that a run can be read if it is not installed.
 _Law = Annotated[str, AfterValidator(_law), WithJsonSchema({"anyOf": [{"enum": list(LAWS)}, _TARGET]})]
 
 
 def one_or_more(value: Any) -> Any:
-    """Some text stands for a list of it alone."""
+    """A text means a list of it alone."""
     return [value] if isinstance(value, str) else value
 
 
@@ -40,7 +40,7 @@ _Mode = Literal["regulate", "track", "image_track"]
 _Modes = Annotated[tuple[_Mode, ...], Field(min_length=1)]
 
 
-# Accelerations that the profile joint_space takes where no limit is given, deg/s² and m/s².
+# Accelerations that the profile joint_space takes if no limit is given, deg/s² and m/s².
 _ACCELERATION_DEG_S2, _ACCELERATION_M_S2 = 500.0, 2.0
 
 
@@ -64,7 +64,7 @@ class LawChoice(Section):
     mode: Annotated[_Modes, BeforeValidator(one_or_more, json_schema_input_type=_Mode | _Modes)] = Field(
         ("regulate",),
         description="regulate moves to the goal by the present images in each step; track and "
-        "image_track follow the plan; a list runs each law in those of the modes that it "
+        "image_track follow the plan; a list runs each law in the modes that it "
         "has",
     )
     must_converge: tuple[_Law, ...] | None = Field(
@@ -75,7 +75,7 @@ class LawChoice(Section):
 
 
 class LawSettings(Section):
-    """Period and gains of the control laws, and what becomes of plans that no joints follow."""
+    """Period and gains of the control laws, and the treatment of plans that no joints follow."""
 
     on_plan_failure: Literal["regulate", "refuse"] = Field(
         "regulate",
@@ -123,7 +123,7 @@ class Control(LawSettings, LawChoice):
 
     @property
     def speed_limits(self) -> SpeedLimits:
-        """Limits of the joints, infinite where no speed is given."""
+        """Limits of the joints, infinite if no speed is given."""
         turn, slide = self.joint_speed_limit_deg_s, self.prismatic_speed_limit_m_s
         return SpeedLimits(
             math.inf if turn is None else math.radians(turn),

@@ -90,9 +90,9 @@ class EachView(ByView):
     """A time for each camera, by its name, s, and for those that are not named."""
 
     __pydantic_extra__: dict[str, Number]
-    left: Number | None = Field(None, description="that of the left camera; others by their names")
-    right: Number | None = Field(None, description="that of the right camera")
-    others: Number | None = Field(None, description="that of cameras that are not named")
+    left: Number | None = Field(None, description="value of the left camera; others by their names")
+    right: Number | None = Field(None, description="value of the right camera")
+    others: Number | None = Field(None, description="value of cameras that are not named")
 
     def of(self, view: str) -> float | None:
         """Return the time of a camera, if it is given."""
@@ -101,7 +101,7 @@ class EachView(ByView):
 
 
 def _of_all(value: Any) -> Any:
-    """One number stands for all cameras."""
+    """One number holds for all cameras."""
     return dict.fromkeys((*VIEWS, "others"), value) if isinstance(value, int | float) else value
 
 
@@ -155,7 +155,7 @@ class Faults(Section):
         if (least := min(latency or 0.0 for _, latency in self.camera_latency_s)) < 0:
             yield ("camera_latency_s",), f"{least:g} is negative: no image comes before it was taken"
         if self.frame_offset_s and self.frame_rate_hz is None:
-            yield ("frame_offset_s",), "is that of cameras that run freely: set frame_rate_hz as well"
+            yield ("frame_offset_s",), "applies to cameras that run freely: set frame_rate_hz as well"
         if self.quantize_setpoints and self.encoder_counts_per_turn is None:
             yield ("quantize_setpoints",), "takes the ticks of encoders: set encoder_counts_per_turn as well"
 

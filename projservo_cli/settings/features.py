@@ -21,7 +21,7 @@ def is_name(name: str) -> bool:
 
 
 def _name(name: str) -> str:
-    """A name; else ValueError."""
+    """A name; otherwise ValueError."""
     if not is_name(name):
         raise ValueError("must be a name of small letters, digits and _, which begins with a letter")
     return name
@@ -34,13 +34,13 @@ Name = Annotated[
 ]
 
 
-def _numbers_or_name(least: int, most: int) -> BeforeValidator:
-    """Refuse in one line what is neither so many numbers of markers nor a name."""
+def _numbers_or_name(min_count: int, max_count: int) -> BeforeValidator:
+    """Refuse, in one line, a value that is neither such a number of markers nor a name."""
 
     def checked(value: Any) -> Any:
         whole = isinstance(value, (list, tuple)) and all(type(x) is int and x >= 0 for x in value)
-        if not (value is None or isinstance(value, str) or (whole and least <= len(value) <= most)):
-            count = str(least) if least == most else f"{least} to {most}"
+        if not (value is None or isinstance(value, str) or (whole and min_count <= len(value) <= max_count)):
+            count = str(min_count) if min_count == max_count else f"{min_count} to {max_count}"
             raise ValueError(f"must be numbers of {count} markers, or the name of a feature of the tool")
         return value
 
@@ -53,15 +53,15 @@ _Plane = Annotated[tuple[Whole, ...], Field(min_length=3, max_length=3)]
 
 
 class Feature(OneOf):
-    """A point, line or plane of the tool or an object through its markers, or where that of the tool was."""
+    """A point, line or plane through markers of the tool or an object, or as a feature of the tool was."""
 
     one_of = KINDS
     on: Name = Field(
-        description="what the feature moves with: tool, scene, which stands still, or the name of an object"
+        description="what the feature moves with: tool, scene, which is fixed, or the name of an object"
     )
     point: Annotated[_Point | Name | None, _numbers_or_name(1, _MOST)] = Field(
         None,
-        description="numbers of markers of the tool or object, whose middle it is; else the point of the "
+        description="numbers of markers of the tool or object, whose middle it is; or the point of the "
         "tool that was there when the goal was taught",
     )
     line: Annotated[_Line | Name | None, _numbers_or_name(2, 2)] = Field(
@@ -74,11 +74,11 @@ class Feature(OneOf):
     def of_kind(self) -> Iterator[Note]:
         """Markers of the scene or twice the same, and a tool that names another feature."""
         if self.on == _TOOL and isinstance(self.source, str):
-            yield (self.kind,), "of the tool are numbers of its markers; a name stands for one of the scene"
+            yield (self.kind,), "of the tool are numbers of its markers; a name means one of the scene"
         if self.on == _SCENE and not isinstance(self.source, str):
             yield (self.kind,), "of the scene is the name of a feature of the tool that was there when taught"
         if isinstance(self.source, tuple) and len(set(self.source)) < len(self.source):
-            yield (self.kind,), "a marker stands here twice"
+            yield (self.kind,), "a marker occurs here twice"
 
     @property
     def source(self) -> tuple[int, ...] | str:
@@ -87,14 +87,14 @@ class Feature(OneOf):
         return source
 
     def flat(self, features: Mapping[str, "Feature"]) -> tuple[tuple[int, ...], ...]:
-        """Numbers of the markers of each point that spans it, of its own or of the feature that it names."""
+        """Numbers of the markers of each point that spans it, of its own or of a named feature."""
         if isinstance(self.source, str):
             return features[self.source].flat(features)
         return (self.source,) if self.kind == KINDS[0] else tuple((number,) for number in self.source)
 
 
 def _pair(value: Any) -> Any:
-    """A pair of names, perhaps with how both lie; else ValueError."""
+    """A pair of names, perhaps with their relation; otherwise ValueError."""
     if not (isinstance(value, (list, tuple)) and len(value) in (2, 3)) or not all(
         isinstance(name, str) for name in value[:2]
     ):
@@ -108,7 +108,7 @@ def _pair(value: Any) -> Any:
 
 
 _Relation = Literal["meet", "parallel", "perpendicular"] | Annotated[Number, Field(gt=0, lt=180)]
-# Of the tool and of the scene, which meet if not said.
+# A pair of features of the tool and of the scene; by default they meet.
 Pair = Annotated[tuple[Name, Name] | tuple[Name, Name, _Relation], BeforeValidator(_pair)]
 
 

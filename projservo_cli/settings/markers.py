@@ -15,8 +15,8 @@ from projservo_cli.settings.sections import Note, Pose, Positive, Section, Text,
 GROUND = 4.0 / 3.0
 """Width of a tag of six cells with a bright margin of one cell, over that without."""
 
-_SIZE_M = 0.06  # of tags, where none is given
-_TILT = math.radians(35.0)  # of the four tags around the middle one of a roof
+_SIZE_M = 0.06  # default size of tags
+_TILT = math.radians(35.0)  # tilt of the four tags around the middle one of a roof
 _CORNERS = ((-0.5, 0.5), (0.5, 0.5), (0.5, -0.5), (-0.5, -0.5))  # as they are detected, in sides of the tag
 
 
@@ -170,7 +170,7 @@ class Markers(Section):
 
     @property
     def points(self) -> FloatArray | None:
-        """Positions (m, 3) of all markers in the frame of the tool, m; None where they are not known."""
+        """Positions (m, 3) of all markers in the frame of the tool, m; None if they are not known."""
         if self.tags is not None:
             return np.concatenate([tag.corners for tag in self.all_tags])
         return None if self.positions_m is None else np.array(self.positions_m)
@@ -195,7 +195,7 @@ class Markers(Section):
 
     @property
     def front(self) -> tuple[int, ...] | None:
-        """Numbers of the face: those given, else of the tag that looks most where all of them look.
+        """Numbers of the face: as given, otherwise of the tag that points forward most.
 
         Of a board, the outermost corners.
         """
@@ -231,21 +231,21 @@ class Markers(Section):
             for key in self.given(*others) if self.given(whole) else ():
                 yield (key,), f"{whole} is set as well, whose corners are the markers; keep one"
         if self.board is not None and self.dictionary is not None:
-            yield ("dictionary",), "is of tags: that of the board is board.dictionary"
+            yield ("dictionary",), "applies to tags: a board has board.dictionary"
         numbers = [tag.number for tag in self.all_tags]
         if len(set(numbers)) < len(numbers):
-            yield ("tags",), "the number of a tag stands here twice"
+            yield ("tags",), "the number of a tag occurs here twice"
         known, face = self.known, self.front or ()
         if known is not None:
             if self.positions_m is not None and len(known) != len(self.positions_m):
                 yield ("numbers",), f"{len(known)} numbers for {len(self.positions_m)} positions_m"
             if self.numbers is not None and len(set(known)) < len(known):
-                yield ("numbers",), "a number stands here twice"
+                yield ("numbers",), "a number occurs here twice"
             yield from self.unknown(face, "face")
         if face and self.center not in ("midpoint", *face):
             yield ("center",), f"marker {self.center} is not on the face; face: {_listed(face)}"
         if len(set(face)) < len(face):
-            yield ("face",), "a marker stands here twice"
+            yield ("face",), "a marker occurs here twice"
 
     def unknown(self, numbers: Sequence[int], *path: str) -> Iterator[Note]:
         """Numbers at a path that no marker has, as far as markers are known."""

@@ -42,13 +42,11 @@ class Noise(LoopNoise):
     outlier_share: Number = Field(
         0.0, ge=0, lt=1, description="share of the markers of an image that are outliers"
     )
-    outlier_factor: Number = Field(
-        20.0, ge=1, description="standard deviation of outliers, over that of the noise"
-    )
+    outlier_factor: Number = Field(20.0, ge=1, description="standard deviation of outliers, over the noise")
 
 
 class Data(Section):
-    """A recorded run: the observation table that stands in for simulated trial motions."""
+    """A recorded run: the observation table that replaces simulated trial motions."""
 
     table: Text = Field(description="path of the table, relative to the configuration")
     readings: Text | None = Field(
@@ -58,13 +56,13 @@ class Data(Section):
     )
     joints: Annotated[str, StringConstraints(pattern=r"^[RrPp]+$"), AfterValidator(str.upper)] | None = Field(
         None,
-        description="joint types, one letter R or P for each column q1 ... qN; null: those of robot, "
+        description="joint types, one letter R or P for each column q1 ... qN; null: the types of robot, "
         "else all R",
     )
     mount: Literal["world", "tool"] | None = Field(
         None,
-        description="world: cameras stand still and watch the tool; tool: they are on it and watch the "
-        "scene; null: as the table states, else world",
+        description="world: fixed cameras watch the tool; tool: they are on it and watch the "
+        "scene; null: as the table states, otherwise world",
     )
     joint_unit: Literal["deg", "rad"] | None = Field(
         None,
@@ -78,6 +76,6 @@ class Data(Section):
     noise_px: Positive | None = Field(None, description="pixel noise per coordinate; null: estimated")
     image_size_px: SizesByName | None = Field(
         None,
-        description="width and height of all images, or those of each view, in order or by name; null: those "
+        description="width and height of all images, or of each view, in order or by name; null: those "
         "of cameras or rig",
     )

@@ -1,4 +1,4 @@
-"""Objects of the scene that goals are taught on, told apart by their markers."""
+"""Objects of the scene that goals are taught on, identified by their markers."""
 
 from collections.abc import Iterator, Mapping
 from typing import Annotated, Any
@@ -15,7 +15,7 @@ from projservo_cli.settings.markers import Tag
 from projservo_cli.settings.sections import Note, OneOf, Positive, Section, Vector3, Whole
 
 WORLD_AND_TOOL = ("scene", "tool")
-"""What a feature moves with besides objects, whose names they cannot be."""
+"""Carriers of features besides objects; objects cannot have these names."""
 _MOST = Field(max_length=250)  # tags
 _LEAST = 3  # markers that show how an object is turned
 
@@ -24,7 +24,7 @@ _NUMBERS, _PLACED = "tuple[int]", "tuple[Tag]"  # as pydantic calls kinds of lis
 
 
 def _kind(tags: Any) -> str | None:
-    """Which of both kinds of lists some tags are; None for anything else."""
+    """The kind of list that some tags are, of two; None for other values."""
     each = tags if isinstance(tags, (list, tuple)) else ()
     if each and all(isinstance(one, (dict, Tag)) for one in each):
         return _PLACED
@@ -111,7 +111,7 @@ class ObjectSettings(OneOf):
     def of_kind(self) -> Iterator[Note]:
         """Too few markers or the same twice, and places of others than these."""
         if len({*self.numbers}) < len(self.numbers):
-            yield (self.kind,), "a number stands here twice"
+            yield (self.kind,), "a number occurs here twice"
         if len(self.numbers) < _LEAST:
             what = f"{len(self.numbers)} markers do not show how it is turned: name {_LEAST} or more"
             yield (self.kind,), what
@@ -135,7 +135,7 @@ class Objects(Section):
     )
     max_rotation_deg: Positive = Field(90.0, description="rotation of an object, likewise")
     max_goal_deviation_mm: Positive = Field(
-        5.0, description="standard deviation of a carried goal that plan accepts, where a length is known"
+        5.0, description="standard deviation of a carried goal that plan accepts, if a length is known"
     )
     max_goal_deviation_px: Positive = Field(
         5.0, description="likewise of its images, rms per marker and view"

@@ -40,7 +40,7 @@ class RenderedOptions(Section):
 
     servo: Literal["own", "position", "velocity"] = Field(
         "own",
-        description="actuators: position or velocity servos; own for those of robot.mjcf, else position",
+        description="position or velocity servos; own for the actuators of robot.mjcf, otherwise position",
     )
     grey_noise: NotNegative = Field(
         2.0, description="standard deviation of the image noise, grey levels of 255"
@@ -73,7 +73,7 @@ class RobotClass(Section):
 
     @property
     def target(self) -> str:
-        """The class of a robot of somebody's; empty for a simulated one."""
+        """The class of the user's robot; empty for a simulated one."""
         return "" if self.simulated else self.use or ""
 
     @property
@@ -99,7 +99,7 @@ class ServoLimits(Section):
 
 
 class Rest(Section):
-    """For how long a robot stands still before it is looked at, and how many images are averaged then."""
+    """How long a robot rests before it is observed, and how many images are averaged then."""
 
     averaged_frames: StrictInt = Field(
         1, ge=1, le=1000, description="number of images of each pose that record averages"
@@ -110,7 +110,7 @@ class Rest(Section):
 
 
 class RunConditions(Section):
-    """How fast a law drives the robot, what its cameras see, and where a run of it stops."""
+    """Speed of a law, models of the robot and its cameras, and conditions that end a run."""
 
     speed_scale: Number = Field(1.0, gt=0, le=1, description="factor of all commanded velocities")
     self_occlusion: Literal["transparent", "opaque"] = Field(

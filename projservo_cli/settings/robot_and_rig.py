@@ -33,12 +33,12 @@ _IDENTITY: Pose = (
     (0.0, 0.0, 1.0, 0.0),
     (0.0, 0.0, 0.0, 1.0),
 )
-# Limits in rad of two turns to a side or less; those of continuous joints in files are beyond any in degrees.
+# Limits in rad of two turns to a side or less; limits of continuous joints in files exceed any in degrees.
 _MOST_DEG = 1000.0
 
 
 def like_degrees(low: float, high: float) -> str:
-    """Return the reason why limits of a revolute joint that are to be rad look like degrees, else nothing."""
+    """Return a reason if limits of a revolute joint look like degrees, not rad; otherwise an empty text."""
     alike = TWO_TURNS < max(abs(low), abs(high)) <= _MOST_DEG
     return f"{low:g} to {high:g} rad is more than two turns to a side: degrees?" if alike else ""
 
@@ -54,7 +54,7 @@ class _Joint(Section):
 
     @property
     def limits(self) -> tuple[float, float]:
-        """Lowest and highest reading in rad or m; infinite where none is set."""
+        """Lowest and highest reading in rad or m; infinite if none is set."""
         if self.limits_deg is not None:
             return math.radians(self.limits_deg[0]), math.radians(self.limits_deg[1])
         return self.limits_rad or self.limits_m or (-math.inf, math.inf)
@@ -137,7 +137,7 @@ class LimitSettings(OneOf):
         """Two ways to say them or none, or a unit too many or too few."""
         yield from super().contradictions()
         if (self.joints is None) != (self.unit is None):
-            yield ("unit",), "is that of joints: give both or neither"
+            yield ("unit",), "applies to joints: give both or neither"
 
     def values(self, joint_types: str) -> tuple[tuple[float, float], ...]:
         """Those that are given, in rad (R) and m (P), one for each letter of ``joint_types``.
@@ -178,12 +178,12 @@ class RobotSettings(Section):
 
     @property
     def ranges(self) -> tuple[tuple[float, float], ...]:
-        """Lowest and highest reading of each joint of dh or screws, rad or m; infinite where none is set."""
+        """Lowest and highest reading of each joint of dh or screws, rad or m; infinite if none is set."""
         return tuple(joint.limits for joint in self.joints)
 
     def contradictions(self) -> Iterator[Note]:
         """Yield missing or several descriptions of joints and limits; a file without a tip."""
-        screws = None if self.mjcf is not None else self.screws  # those of the file
+        screws = None if self.mjcf is not None else self.screws  # screws of the file
         if (self.dh, screws, self.mjcf, self.urdf, self.limits).count(None) != 4:
             yield (), "give exactly one of dh, screws, mjcf, urdf and, for an external robot, limits"
         if (self.tip is None) != (self.mjcf is None and self.urdf is None):
@@ -219,8 +219,8 @@ class Camera(Section):
             if not P.any() or abs(np.linalg.det(P[:, :3] / abs(P).max())) < 1e-12:
                 yield ("matrix",), "its left 3×3 block is singular: no finite pinhole camera"
         elif missing:
-            told = f" (missing: {', '.join(missing)})" if given else ""
-            yield (), f"give matrix, or all of {', '.join(wanted)}{told}"
+            missing_text = f" (missing: {', '.join(missing)})" if given else ""
+            yield (), f"give matrix, or all of {', '.join(wanted)}{missing_text}"
         elif self.position_m == self.target_m:
             yield ("target_m",), "is the position of the camera; it must look somewhere"
         else:
@@ -234,10 +234,10 @@ class Rig(ByView):
 
     __pydantic_extra__: dict[str, Camera]
 
-    image_size_px: Sizes = Field(description="width and height of all images, or those of each")
+    image_size_px: Sizes = Field(description="width and height of all images, or of each")
     mount: Literal["world", "tool"] = Field(
         "world",
-        description="world: cameras stand still, given in the base frame; tool: they are on it, given in its "
+        description="world: fixed cameras, given in the base frame; tool: they are on it, given in its "
         "frame, and markers belong to the scene, given in the base frame",
     )
 

@@ -1,4 +1,4 @@
-"""Sections of a configuration: frozen values, each with its unit in its name, and what contradicts them."""
+"""Sections of a configuration: frozen values, each with its unit in its name, and their contradictions."""
 
 import math
 import re
@@ -39,14 +39,14 @@ Text = Annotated[str, StringConstraints(min_length=1)]
 
 
 def _limits(limits: Vector2) -> Vector2:
-    """Two limits, the lower first; else ValueError."""
+    """Two limits, the lower first; otherwise ValueError."""
     low, high = limits
     if low >= high:
         raise ValueError(f"the lower limit {low:g} must be below the upper limit {high:g}")
     return limits
 
 
-_TOLERANCE = 1e-6  # of rotations and unit axes written with seven digits or more
+_TOLERANCE = 1e-6  # tolerance of rotations and unit axes written with seven digits or more
 
 
 def not_rigid(T: Matrix44) -> str:
@@ -60,7 +60,7 @@ def not_rigid(T: Matrix44) -> str:
 
 
 def _pose(T: Matrix44) -> Matrix44:
-    """A matrix that is a pose; else ValueError."""
+    """A matrix that is a pose; otherwise ValueError."""
     if what := not_rigid(T):
         raise ValueError(what)
     return T
@@ -71,7 +71,7 @@ Pose = Annotated[Matrix44, AfterValidator(_pose)]
 
 
 def _one_or_each(value: Any, of_one: Callable[[Any], tuple[int, int]]) -> Any:
-    """Width and height of all images, or, where their sizes differ, those of each view."""
+    """Width and height of all images, or, if their sizes differ, of each view."""
     several = isinstance(value, (list, tuple)) and len(value) > 0
     if not several or not all(isinstance(one, (list, tuple)) for one in value):
         return of_one(value)
@@ -80,7 +80,7 @@ def _one_or_each(value: Any, of_one: Callable[[Any], tuple[int, int]]) -> Any:
 
 
 def _of_each_name(value: Any, of_one: Callable[[Any], tuple[int, int]]) -> Any:
-    """Width and height of all images, those of each view in order, or by its name."""
+    """Width and height of all images, or of each view, in order or by its name."""
     if not isinstance(value, Mapping):
         return _one_or_each(value, of_one)
     sizes = {view_named(str(name)): of_one(size) for name, size in value.items()}
@@ -100,7 +100,7 @@ Sizes = Annotated[
 SizesByName = Annotated[
     tuple[Count, Count],
     WrapValidator(_of_each_name),
-    PlainSerializer(lambda sizes: sizes),  # of whichever form
+    PlainSerializer(lambda sizes: sizes),  # in either form
     WithJsonSchema({"anyOf": [_SIZE, _SIZES, {"type": "object", "additionalProperties": _SIZE}]}),
 ]
 # The path from a section to a value in it, and the error of that value.
@@ -120,7 +120,7 @@ class Section(BaseModel):
         return ()
 
     def given(self, *names: str) -> list[str]:
-        """Return those of some keys that have a value."""
+        """Return the keys that have a value."""
         return [name for name in names if getattr(self, name) is not None]
 
     def part(self, kind: type[_Part]) -> _Part:
@@ -139,7 +139,7 @@ class OneOf(Section):
         return self.given(*self.one_of)[0]
 
     def contradictions(self) -> Iterator[Note]:
-        """Yield that none of the keys is given, or several; else what contradicts the one that is."""
+        """Yield an error if none or several of the keys are given; otherwise the errors of the given one."""
         given = self.given(*self.one_of)
         if len(given) != 1:
             keys = f"{', '.join(self.one_of[:-1])} and {self.one_of[-1]}"
@@ -164,7 +164,7 @@ class ByView(Section):
 
     @property
     def by_view(self) -> dict[str, Any]:
-        """What is given by names of views: left and right first, others in the order of the file."""
+        """Values by names of views: left and right first, others in the order of the file."""
         found = {name: getattr(self, name, None) for name in (*VIEWS, *(self.model_extra or {}))}
         return {name: value for name, value in found.items() if value is not None}
 
@@ -188,8 +188,8 @@ class Root(Section):
     def _consistent(self, info: ValidationInfo) -> Self:
         sound = {key: value for key, value in vars(self).items() if key not in (info.context or ())}
         if found := [*_contradictions(sound.items()), *self.between(sound)]:
-            told = "; ".join(f"{'.'.join(map(str, path))}: {what}" for path, what in found)
-            raise PydanticCustomError(CONTRADICTIONS, "{told}", {"told": told, "found": found})
+            text = "; ".join(f"{'.'.join(map(str, path))}: {what}" for path, what in found)
+            raise PydanticCustomError(CONTRADICTIONS, "{told}", {"told": text, "found": found})
         return self
 
     def between(self, sound: Mapping[str, Any]) -> Iterable[Note]:
@@ -197,7 +197,7 @@ class Root(Section):
         return ()
 
 
-# Largest value of a key by its name: of what is on the tool and other lengths, m, and of short times, s.
+# Largest value of a key by its name: of lengths such as those on the tool, m, and of short times, s.
 _LARGEST = (
     (re.compile(r"(tag_)?size_m|positions_m"), 2.0, "millimetres"),
     (re.compile(r"\w+_m"), FARTHEST_M, "millimetres"),
@@ -231,7 +231,7 @@ def _contradictions(parts: Iterable[tuple[Any, Any]], path: tuple[str | int, ...
 
 
 class JointVector(Section):
-    """Joint readings; ``unit`` is that of the revolute joints, prismatic ones are in metres."""
+    """Joint readings; ``unit`` applies to the revolute joints, prismatic ones are in metres."""
 
     joints: tuple[Number, ...] = Field(min_length=1, description="one reading per joint, base to tool")
     unit: Literal["deg", "rad"] = Field(description="unit of the revolute joints; prismatic joints are in m")

@@ -13,14 +13,14 @@ class Stop(Section):
     image_error_px: Positive = Field(0.01, description="image error below which a run has converged, rms")
     noise_factor: NotNegative = Field(
         2.0,
-        description="image_error_px grows by this factor × noise.servo_px, or × what pixels state if more",
+        description="image_error_px grows by this factor × noise.servo_px, × stated deviations if larger",
     )
     max_steps: Count = Field(2000, description="maximum number of commands")
     diverged_factor: Number = Field(
         10.0, gt=1, description="growth of the image error or the distance at which a run has diverged"
     )
     stall_periods: Count = Field(
-        20, description="periods in which the error must fall by 1 %, else the run makes no progress"
+        20, description="periods in which the error must fall by 1 %, otherwise the run makes no progress"
     )
     max_lost_periods: Whole = Field(
         25, description="periods for which the robot holds while markers are lost"
@@ -41,5 +41,5 @@ class ReportSettings(Section):
     """Files of the report."""
 
     formats: tuple[Literal["svg", "pdf", "png"], ...] = Field(
-        ("svg",), min_length=1, description="file formats of each figure; the page shows SVG, else PNG"
+        ("svg",), min_length=1, description="file formats of each figure; the page shows SVG, otherwise PNG"
     )

@@ -104,13 +104,13 @@ class GoalImages(ByView):
         if not self.view:
             yield (), "give left, right or other cameras by their names: the pixels of the markers there"
         if self.markers is not None and len({*self.markers}) < len(self.markers):
-            yield ("markers",), "a number stands here twice"
+            yield ("markers",), "a number occurs here twice"
         for key, value in (self.model_extra or {}).items():
             named, numbers = _OF_SIGMA.fullmatch(key), any(isinstance(entry, float) for entry in value)
             if named is None and numbers:
-                yield (key,), "unknown key; pixels are [u, v] a marker, deviations stand under sigma_NAME_px"
+                yield (key,), "unknown key; pixels are [u, v] per marker, deviations go under sigma_NAME_px"
             elif named is not None and any(isinstance(entry, tuple) for entry in value):
-                yield (key,), "must be a list of standard deviations, a number a marker"
+                yield (key,), "must be a list of standard deviations, one number per marker"
             elif named is not None and named[1] not in self.view:
                 yield (key,), f"there are no pixels of {named[1]}"
 
@@ -161,7 +161,7 @@ class DisplacedAlong(OneOf):
     """A displacement back along a line, or from a plane along its normal, to the side that cameras see."""
 
     one_of = ("by_m", "by_px")
-    along: Name = Field(description="name of a line or plane, where it is at the pose that is displaced")
+    along: Name = Field(description="name of a line or plane, if it is at the pose that is displaced")
     by_m: Number | None = Field(None, description="length; below 0 the other way; needs a known length")
     by_px: Number | None = Field(
         None,
@@ -206,8 +206,8 @@ class Goal(OneOf):
     )
     on: Name | None = Field(
         None,
-        description="object that the goal was taught on and is carried by; null: that of the features of the "
-        "scene, else none",
+        description="object that the goal was taught on and is carried by; null: the object of the "
+        "features of the scene, if any",
     )
     objects: _ObjectImages = Field(
         _ObjectImages(),
@@ -256,7 +256,7 @@ class TaskStep(OneOf):
     )
 
     def of_kind(self) -> Iterator[Note]:
-        """A duration of what is no motion."""
+        """A duration other than of a motion."""
         if self.duration_s is not None and not self.moves:
             yield ("duration_s",), "is of a motion: to, approach or retreat; the robot class times an action"
 
@@ -282,7 +282,7 @@ CURRENT = "current"
 
 
 def _start(value: Any, read: Callable[[Any], Any]) -> Any:
-    """The word for where the arm stands, or joints."""
+    """The word for the current joints, or joints."""
     del read  # which would name both kinds in every message
     return value if value == CURRENT else JointVector.model_validate(value)
 
@@ -290,7 +290,7 @@ def _start(value: Any, read: Callable[[Any], Any]) -> Any:
 class TaskSettings(Section):
     """A reaching task from ``start`` to ``goal``, or a sequence of them.
 
-    ``start_offset`` moves the start alone: a goal that is a turn stays that of the start without it.
+    ``start_offset`` moves the start alone: a goal that is a turn starts from the start without it.
     """
 
     start: Annotated[JointVector | Literal["current"], WrapValidator(_start)] = Field(
@@ -298,7 +298,7 @@ class TaskSettings(Section):
         "calibration.reference"
     )
     start_offset: JointVector | None = Field(
-        None, description="offset of the start; the goal stays that of the start without it"
+        None, description="offset of the start; the goal follows from the start without it"
     )
     goal: Goal
     goals: dict[Name, Goal] = Field({}, description="goals of the steps, by their names")
@@ -316,7 +316,7 @@ class TaskSettings(Section):
 
     @property
     def each_goal(self) -> dict[tuple[str, ...], Goal]:
-        """Return the goal and those of the steps, by their places in the section."""
+        """Return the goal and the goals of the steps, by their places in the section."""
         return {("goal",): self.goal} | {("goals", name): goal for name, goal in self.goals.items()}
 
     @property
@@ -340,7 +340,7 @@ class TaskSettings(Section):
         return self.model_copy(update={**start, "goal": goal, "goals": {}, "steps": ()})
 
     def _retreat(self, name: str) -> Goal:
-        """Return the start of a retreat, displaced: what was free at the goal before stays so."""
+        """Return the start of a retreat, displaced: freedoms of the goal before stay free."""
         k = list(self.named_steps).index(name)
         before = [one.goal for one in self.steps[:k] if one.goal is not None]
         incidences = self.goals[before[-1]].incidences if before else ()
@@ -349,7 +349,7 @@ class TaskSettings(Section):
     def contradictions(self) -> Iterator[Note]:
         """An offset from nowhere, steps to unknown goals, and without a motion."""
         if self.start == CURRENT and self.start_offset is not None:
-            yield ("start_offset",), "is that of joints: leave it out with start: current"
+            yield ("start_offset",), "applies to joints: leave it out with start: current"
         for k, step in enumerate(self.steps):
             name = None if any(step.contradictions()) else step.goal
             if name is not None and name not in self.goals:
@@ -376,7 +376,7 @@ class KeptOut(ByView):
     right: _Polygon | None = Field(None, description="corners u and v in the right image, px; null: none")
     occludes: StrictBool = Field(
         True,
-        description="whether the obstacle may occlude markers; those of the face stay outside in all images",
+        description="whether the obstacle may occlude markers other than the face, which stays outside",
     )
 
     def contradictions(self) -> Iterator[Note]:
@@ -432,7 +432,7 @@ class Trajectory(Section):
     """Profile of the planned motion over the path parameter in [0, 1], and its constraints.
 
     ``joint_space`` plans a path through joint space to any goal configuration. ``auto`` takes ``linear`` if
-    it meets every constraint, else ``constrained``, else ``joint_space``.
+    it meets every constraint, then ``constrained``, then ``joint_space``.
     """
 
     profile: Literal[
@@ -506,7 +506,7 @@ class Trajectory(Section):
         return self.profile not in ("constrained", "auto")
 
     @property
-    def least_views(self) -> int | None:
+    def min_views(self) -> int | None:
         """Number of cameras that must see the whole face; None for all."""
         return None if self.visible_views == "all" else self.visible_views
 

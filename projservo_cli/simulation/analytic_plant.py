@@ -1,4 +1,4 @@
-"""The ideal plant: a robot that stands wherever it is sent, as the compiled loop sees it."""
+"""The ideal plant: a robot that reaches every set-point, as the compiled loop sees it."""
 
 import math
 from typing import NamedTuple
@@ -20,7 +20,7 @@ class Ends(NamedTuple):
     """True poses of the tool."""
 
     base_tool: FloatArray  # (4, 4) pose of the tool at the reference, m
-    goal_pose: FloatArray  # (4, 4) pose at the goal, m; NaN where it is not known
+    goal_pose: FloatArray  # (4, 4) pose at the goal, m; NaN if it is not known
     goal: FloatArray  # (4,) centre of the face there, m
 
 
@@ -33,10 +33,10 @@ class Plant(NamedTuple):
     center: int  # index of the centre marker, or ``MIDPOINT``
     O: FloatArray  # (V, 4) optical centres
     visible: FloatArray  # (V,) sign of a·O on the visible side of the face
-    image_size: FloatArray  # (V, 2) width and height of each image, px; infinite where it has no border
-    limits: JointLimits  # of the joints
+    image_size: FloatArray  # (V, 2) width and height of each image, px; infinite if it has no border
+    limits: JointLimits  # limits of the joints
     opaque: bool  # whether the face hides its markers from a camera behind it
-    least_views: int  # number of views that are to see the face
+    min_views: int  # number of views that are to see the face
     # (p, 4) further markers of the body at the reference, m; a camera sees those within its image
     pins: FloatArray = NO_PINS
 
@@ -47,8 +47,8 @@ def observe(plant: Plant, H: Mat4, M: FloatArray, s: FloatArray, hidden: FloatAr
 
     M : (m, 4) on return the points of the face.
     s : (V, m + p, 2) on return the pixels of face and pins, NaN where unseen.
-    hidden : (V,) on return 1 where the face is self-occluded in a view.
-    Returns false where fewer cameras than are to see it have the whole face before them.
+    hidden : (V,) on return 1 if the face is self-occluded in a view.
+    Returns false if fewer cameras than are to see it have the whole face before them.
     """
     m = M.shape[0]
     for k in range(m):
@@ -73,12 +73,12 @@ def observe(plant: Plant, H: Mat4, M: FloatArray, s: FloatArray, hidden: FloatAr
             if projected and from_border(plant.image_size[view], pixel[0], pixel[1]) < 0.0:
                 pixel[:] = math.nan
         behind += not in_front
-    return bool(behind <= plant.O.shape[0] - plant.least_views)
+    return bool(behind <= plant.O.shape[0] - plant.min_views)
 
 
 @merged
 def _put_pixel(camera: FloatArray, lens: FloatArray, A: Vec4, pixel: FloatArray) -> bool:
-    """Write the pixel (2,) of a point; where it is not in front of the camera, NaN, and return False."""
+    """Write the pixel (2,) of a point; if it is not in front of the camera, NaN, and return False."""
     depth = row(camera, 2, A)
     if not depth > 0.0:
         pixel[:] = math.nan
@@ -91,9 +91,9 @@ def _put_pixel(camera: FloatArray, lens: FloatArray, A: Vec4, pixel: FloatArray)
 def shows_face(plant: Plant, H: Mat4, hidden: FloatArray, pixel: FloatArray) -> bool:
     """Whether enough images truly show every marker of the face, from its front, after the displacement H.
 
-    hidden : (V,) 1 where the face is self-occluded; pixel : (2 or more,) workspace.
+    hidden : (V,) 1 if the face is self-occluded; pixel : (2 or more,) workspace.
     """
-    shown = 0
+    n_views = 0
     for view in range(plant.O.shape[0]):
         whole = not hidden[view] > 0.5
         for k in range(plant.M.shape[0]):
@@ -103,8 +103,8 @@ def shows_face(plant: Plant, H: Mat4, hidden: FloatArray, pixel: FloatArray) -> 
                 or from_border(plant.image_size[view], pixel[0], pixel[1]) < 0.0
             ):
                 whole = False
-        shown += whole
-    return bool(shown >= plant.least_views)
+        n_views += whole
+    return bool(n_views >= plant.min_views)
 
 
 @merged
@@ -124,10 +124,10 @@ class AnalyticPlant:
     q_start : (n,) first joints, rad or m.
     noise : (k, V, markers, 2) added to the pixels of each observation in turn, px.
     ``q, H``: (n,) true joints, rad or m, and (4, 4) displacement of the face. ``in_front``: whether every
-    marker was in front of enough cameras when last observed. ``markers``: how many are observed, those of
-    the face first. ``hidden``: (V,) 1 where the face was self-occluded when last observed.
-    ``disturbance``: why the law that drove it failed; else None. ``takes_parts``: it goes straight to the
-    end of each step; the samples are the same. ``weight``: all pixels weigh alike. ``holds, pending``:
+    marker was in front of enough cameras when last observed. ``markers``: number that is observed, markers of
+    the face first. ``hidden``: (V,) 1 if the face was self-occluded when last observed.
+    ``disturbance``: why the law that drove it failed; otherwise None. ``takes_parts``: it goes straight to
+    the end of each step; the samples are the same. ``weight``: all pixels weigh alike. ``holds, pending``:
     nothing tests its images.
     """
 

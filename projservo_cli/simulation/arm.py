@@ -22,10 +22,10 @@ class SerialArm(NamedTuple):
     """True kinematics of a serial robot in its base frame."""
 
     H_hat_0: FloatArray  # (n, 4, 4) twists at the reference, per rad or m
-    prismatic: BoolArray  # (n,) whether a joint is prismatic; it is revolute else
+    prismatic: BoolArray  # (n,) whether a joint is prismatic; otherwise it is revolute
     q_reference: FloatArray  # (n,) rad or m
     base_tool: FloatArray  # (4, 4) pose of the tool at the reference, m
-    limits: JointLimits  # of the joints
+    limits: JointLimits  # limits of the joints
 
     def model(self, P: FloatArray, lens: FloatArray | None = None, *, on_tool: bool = False) -> Model:
         """Metric model of the robot seen by the cameras P (V, 3, 4) with lenses (V, 5).
@@ -129,7 +129,7 @@ def inverse_kinematics(robot: SerialArm, goal: FloatArray, q_start: FloatArray) 
 
 
 def _newton(robot: SerialArm, goal: FloatArray, q: FloatArray) -> FloatArray | None:
-    """Damped Newton steps to a pose; None where they do not arrive.
+    """Damped Newton steps to a pose; None if they do not arrive.
 
     The truth of a simulation is a metric pose, to 1e-13, whereas planning has images of a face alone.
     """
@@ -144,7 +144,7 @@ def _newton(robot: SerialArm, goal: FloatArray, q: FloatArray) -> FloatArray | N
         tip = H_hat @ pose[:, 3]
         J = np.stack([H_hat[:, 2, 1], H_hat[:, 0, 2], H_hat[:, 1, 0], *tip.T[:3]])
         damping = 1e-9 * float(error @ error)
-        if len(q) > len(error):  # of minimum norm
+        if len(q) > len(error):  # step of minimum norm
             step = J.T @ np.linalg.solve(J @ J.T + damping * np.eye(len(error)), error)
         else:
             step = np.linalg.solve(J.T @ J + damping * np.eye(len(q)), J.T @ error)

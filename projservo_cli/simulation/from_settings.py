@@ -94,13 +94,13 @@ def described_truth(
     """Robot, rig and markers as they are, and how pixels err.
 
     face : whether the truth has the face, of which a calibration knows nothing.
-    k1 : radial distortion of all rendered lenses, in units of the focal length, instead of those of the rig.
+    k1 : radial distortion of all rendered lenses, in units of the focal length, instead of the rig's.
     """
-    bent = np.array([(k1, 0.0) if k1 else camera.lens for camera in rig.cameras.values()])
+    coefficients = np.array([(k1, 0.0) if k1 else camera.lens for camera in rig.cameras.values()])
     arm, P, numbers = arm_of(robot), cameras_of(rig), markers.known
     assert numbers is not None
     points, on_tool = np.c_[markers.points, np.ones(len(numbers))], rig.mount == TOOL
-    # What rides on the tool is given in its frame, and what stands still in that of the base.
+    # Parts on the tool are given in its frame, fixed ones in the frame of the base.
     base_tool = np.eye(4) if on_tool else arm.base_tool
     return Truth(
         robot=arm,
@@ -110,7 +110,7 @@ def described_truth(
         face=tuple(numbers.index(number) for number in markers.front or ()) if face else (),
         center=center_in_face(markers),
         image_size=image_sizes(rig.image_size_px, tuple(rig.cameras)),
-        lens=lens_of(P, *bent.T) if bent.any() else no_lenses(len(P)),
+        lens=lens_of(P, *coefficients.T) if coefficients.any() else no_lenses(len(P)),
         normals=np.zeros(3) if markers.normals is None else markers.normals @ base_tool[:3, :3].T,
         view=tuple(rig.cameras),
         on_tool=on_tool,
@@ -129,7 +129,7 @@ def described_scene(
 ) -> RenderedScene:
     """Return the scene before rendered cameras.
 
-    mjcf : the model of the arm, None for capsules; objects : tags of objects where they stand.
+    mjcf : the model of the arm, None for capsules; objects : tags of objects at their places.
     """
     assert markers.known is not None
     further = [number for tag in objects for number in tag.numbers]

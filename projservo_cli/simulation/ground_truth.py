@@ -45,8 +45,8 @@ from projservo_cli.simulation.arm import (
 from projservo_cli.simulation.random_streams import NORMAL, NoiseShape
 from projservo_cli.task.face import center_of, cyclic_order, face_plane
 
-_EDGE_OF_FACE = 1e-9  # of a·O, from where a face is seen edge-on
-_EDGE_ON = math.cos(math.radians(70.0))  # of the angle to a camera from which tags are not found
+_EDGE_OF_FACE = 1e-9  # limit of a·O below which a face is seen edge-on
+_EDGE_ON = math.cos(math.radians(70.0))  # cosine of the angle to a camera from which tags are not found
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,11 +57,11 @@ class Truth:
     P: FloatArray  # (V, 3, 4) true cameras at the robot's reference, from the base frame, px
     M: FloatArray  # (m, 4) all markers at the robot's reference, m
     number: tuple[int, ...]  # (m,) their numbers
-    face: tuple[int, ...]  # indices of the face markers; none where the configuration has no face
+    face: tuple[int, ...]  # indices of the face markers; none if the configuration has no face
     center: int  # position of the centre marker within the face, or ``MIDPOINT``
     image_size: FloatArray  # (V, 2) width and height of each image, px
     lens: FloatArray  # (V, 5) true lenses
-    # (m, 3) directions that markers look in at the robot's reference; zero where they are seen from anywhere
+    # (m, 3) directions that markers look in at the robot's reference; zero if they are seen from anywhere
     normals: FloatArray = field(default_factory=lambda: np.zeros(3))
     view: tuple[str, ...] = VIEWS  # names of the views
     on_tool: bool = False  # whether the cameras are on the tool, and markers belong to the scene
@@ -74,7 +74,7 @@ class Truth:
 
     @cached_property
     def calibration(self) -> Calibration:
-        """Calibration of somebody who knows all this: without an error, and without a covariance."""
+        """Calibration from the truth: without an error, and without a covariance."""
         n, unknown = len(self.model.prismatic), np.full((0, 0), np.nan)
         none, still, never = np.zeros((0, 3), dtype=np.int64), np.full(n, np.nan), np.zeros(n, dtype=np.bool_)
         return Calibration(
@@ -181,7 +181,7 @@ class SceneObject(NamedTuple):
     name: str
     number: tuple[int, ...]  # (k,) numbers of its markers
     X: FloatArray  # (k, 4) these when the goal was taught, in the base frame, m
-    normals: FloatArray  # (k, 3) directions that they looked in; zero where they are seen from anywhere
+    normals: FloatArray  # (k, 3) directions that they looked in; zero if they are seen from anywhere
     T: FloatArray  # (4, 4) displacement since
 
     def displaced(self, by: Displacement) -> "SceneObject":
@@ -204,8 +204,8 @@ def _about_axis(point: FloatArray, direction: FloatArray, theta: float) -> Float
 def turned(goal: Goal, arm: SerialArm, P: FloatArray, q_start: FloatArray) -> FloatArray:
     """Joints (n,) of a goal that is a turn of the tool about the roll axis of the rig from joints (n,).
 
-    arm, P : the arm and the cameras (V, 3, 4) where it stands, m. The pose is perhaps displaced a little
-    along the axes of the tool. Raises WorkFailed where no joints reach it.
+    arm, P : the arm and the cameras (V, 3, 4) at its place, m. The pose is perhaps displaced a little
+    along the axes of the tool. Raises WorkFailed if no joints reach it.
     """
     assert goal.roll_deg is not None
     point, direction = roll_axis(P)
@@ -218,32 +218,32 @@ def turned(goal: Goal, arm: SerialArm, P: FloatArray, q_start: FloatArray) -> Fl
     return inverse_kinematics(arm, pose, q_start)
 
 
-def plant_of(truth: Truth, q_start: FloatArray, *, opaque: bool, least_views: int = 0) -> Plant:
+def plant_of(truth: Truth, q_start: FloatArray, *, opaque: bool, min_views: int = 0) -> Plant:
     """The truth as the loop sees it from the joints q_start (n,), undisturbed.
 
     opaque : whether the face hides its markers from a camera behind it.
-    least_views : number of views that are to see the face, 0 for all.
+    min_views : number of views that are to see the face, 0 for all.
     Raises WorkFailed if a camera sees the face edge-on there.
     """
-    return _plant_at(truth, q_start.tobytes(), opaque, least_views or len(truth.P))
+    return _plant_at(truth, q_start.tobytes(), opaque, min_views or len(truth.P))
 
 
-def _front(truth: Truth, H: FloatArray, a: FloatArray, sides: FloatArray, least_views: int) -> float:
+def _front(truth: Truth, H: FloatArray, a: FloatArray, sides: FloatArray, min_views: int) -> float:
     """Sign of the plane a (4,) of the face before it, after the displacement H (4, 4).
 
-    By the directions that its markers look in where so many cameras see them; else that of most cameras,
+    By the directions that its markers look in where enough cameras see them; otherwise of most cameras,
     whose sides of it are a·O (V,).
     """
     normals = truth.normals[list(truth.face)] if truth.normals.ndim > 1 else truth.normals[None]
     towards = np.sign(a[:3] @ H[:3, :3] @ normals.mean(axis=0))
-    if np.sum(towards * sides > _EDGE_OF_FACE) >= least_views:
+    if np.sum(towards * sides > _EDGE_OF_FACE) >= min_views:
         return float(towards)
     total = np.sign(sides).sum()
     return float(np.sign(total if total else sides[0]) or 1.0)
 
 
 @lru_cache(maxsize=2048)
-def _plant_at(truth: Truth, start_bytes: bytes, opaque: bool, least_views: int) -> Plant:
+def _plant_at(truth: Truth, start_bytes: bytes, opaque: bool, min_views: int) -> Plant:
     q_start = np.frombuffer(start_bytes)
     M = truth.M_face
     H = truth.displacement(q_start)
@@ -252,11 +252,11 @@ def _plant_at(truth: Truth, start_bytes: bytes, opaque: bool, least_views: int) 
     O = optical_centers(truth.P, METRIC_A_INF)
     a = np.array(face_plane(start, order, center_of(start, truth.center)))
     sides = O @ a
-    front = _front(truth, H, a, sides, least_views)
-    if np.sum(front * sides > _EDGE_OF_FACE) < least_views:
+    front = _front(truth, H, a, sides, min_views)
+    if np.sum(front * sides > _EDGE_OF_FACE) < min_views:
         raise WorkFailed(
             "task.start: the cameras see different sides of the face, or one sees it edge-on: "
-            f"turn the face towards {'both' if len(O) == 2 else 'them' if least_views == len(O) else 'more'}"
+            f"turn the face towards {'both' if len(O) == 2 else 'them' if min_views == len(O) else 'more'}"
         )
     return Plant(
         model=truth.model,
@@ -268,5 +268,5 @@ def _plant_at(truth: Truth, start_bytes: bytes, opaque: bool, least_views: int) 
         image_size=truth.image_size,
         limits=truth.robot.limits,
         opaque=opaque,
-        least_views=least_views,
+        min_views=min_views,
     )

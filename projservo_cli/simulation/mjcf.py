@@ -14,9 +14,9 @@ from projservo_cli.simulation.urdf import arm_screws, joint_screw, listed
 
 
 def mujoco() -> Any:
-    """The module of MuJoCo, which draws without a display where there is none.
+    """The module of MuJoCo, which draws without a display if there is none.
 
-    Raises InputError, with what to install, where it is missing or too old.
+    Raises InputError, with what to install, if it is missing or too old.
     """
     if "mujoco" not in sys.modules and sys.platform == "linux":
         if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
@@ -43,7 +43,7 @@ def no_gl(error: BaseException) -> str:
 
 
 def spec_of(path: str) -> Any:
-    """The specification in an MJCF file; an InputError in one line where there is none."""
+    """The specification in an MJCF file; an InputError in one line if there is none."""
     try:
         return mujoco().MjSpec.from_file(path)
     except ValueError as error:
@@ -51,7 +51,7 @@ def spec_of(path: str) -> Any:
 
 
 def compiled(spec: Any, path: str) -> Any:
-    """The model of a specification; an InputError in one line where it is none."""
+    """The model of a specification; an InputError in one line if it is none."""
     try:
         return spec.compile()
     except ValueError as error:

@@ -1,4 +1,4 @@
-"""The joints of an arm in MuJoCo: servos under gravity, those of its file or made up."""
+"""The joints of an arm in MuJoCo: servos under gravity, from its file or defaults."""
 
 import copy
 import math
@@ -13,14 +13,14 @@ from projservo_cli.simulation.rendering import RenderedModel
 
 _STEP_S = 0.002  # longest step of the integration
 _RATE = 100.0  # 1/s, at which a servo that need not sag takes back an error
-_LOOP_S = 0.1  # in which whoever sends speeds to a servo takes back an error
-_POSTURES = 200  # that are drawn to see what servos have to move
+_LOOP_S = 0.1  # time in which a speed controller corrects an error
+_POSTURES = 200  # random postures to find the loads of servos
 
 
 class _Actuator(NamedTuple):
     """An actuator of a file that drives a joint: force = gain · input + bias · (1, length, its speed).
 
-    It follows lengths where the length has a part in it, else speeds where those have, else it is a motor.
+    It follows lengths if the length has a part in it, otherwise speeds if they have, otherwise it is a motor.
     """
 
     number: int
@@ -48,10 +48,10 @@ class Physics:
     """Servos of the joints of an arm, at first at rest at joints q (n,), rad or m.
 
     lag_s : lag of the set-points. sag : steady-state error of the added servo with the maximum load,
-        rad; where it is zero, and in prismatic joints, they compensate gravity.
-    ``setpoint``: (n,) where joints are sent, rad or m. ``force``: the greatest force on the arm by what is
+        rad; if it is zero, and in prismatic joints, they compensate gravity.
+    ``setpoint``: (n,) where joints are sent, rad or m. ``force``: the greatest force on the arm by contacts
     not part of it, N, in the steps of the last ``follow``.
-    Raises InputError where an actuator of the file cannot be driven, or cannot have this sag.
+    Raises InputError if an actuator of the file cannot be driven, or cannot have this sag.
     """
 
     def __init__(self, rendered: RenderedModel, q: FloatArray, lag_s: float, sag: float) -> None:
@@ -146,7 +146,7 @@ class Physics:
 
     def _carries(self, carrier: int, body: int) -> bool:
         """Whether a body is another, or fixed or jointed to it from there on."""
-        while body > carrier:  # bodies come after what carries them
+        while body > carrier:  # bodies come after their carriers
             body = int(self._model.body_parentid[body])
         return body == carrier
 
@@ -156,9 +156,9 @@ class Physics:
         self.setpoint, self._sent = self.setpoint + by, self._sent + by
 
     def follow(self, setpoint: FloatArray, seconds: float) -> None:
-        """Let so much time pass, s, while the set-point goes evenly to joints (n,), rad or m.
+        """Let ``seconds`` pass while the set-point goes evenly to joints (n,), rad or m.
 
-        Raises WorkFailed where the integration comes to nothing.
+        Raises WorkFailed if the integration comes to nothing.
         """
         if not seconds > 0.0:
             self.setpoint = setpoint
@@ -181,12 +181,12 @@ class Physics:
             )
 
     def _drive(self, speed: FloatArray, h: float) -> None:
-        """Set what servos do in the next step of h, s, where they are sent moving at a speed (n,), per s."""
+        """Actuate servos for the next step of h, s, with set-points moving at a speed (n,), per s."""
         q, data = self.motor, self._data
         gravity, torque = self._gravity(), self._stiffness * (self._sent - q) + self._damping * speed
         torque += np.where(self._compensated, gravity, 0.0)
         data.qfrc_applied[self._rates[self._ours]] = torque[self._ours]
-        # Each motor gives what its joint takes in this posture, where the other joints are free.
+        # Each motor gives the load of its joint in this posture, where the other joints are free.
         inertia = self._free_inertia() if self._motors.size else np.zeros(0)
         off = _RATE**2 * (self._sent - q) + 2.0 * _RATE * (speed - data.qvel[self._rates])
         torque[self._motors] = inertia * off[self._motors] + gravity[self._motors]
@@ -228,7 +228,7 @@ class Physics:
 
 
 def _take(model: Any, joint: int, *, keep: bool) -> _Actuator | None:
-    """The actuator of a file that drives a joint; None where there is none, or none is to be kept.
+    """The actuator of a file that drives a joint; None if there is none, or none is to be kept.
 
     Those that are not kept are put out of action.
     """
@@ -244,7 +244,7 @@ def _take(model: Any, joint: int, *, keep: bool) -> _Actuator | None:
                 model.actuator_gainprm[number], model.actuator_biasprm[number] = 0.0, 0.0
                 continue
             actuators.append(_actuator(model, number))
-    # One that follows lengths comes first, then one that follows speeds, which else damps, then a motor.
+    # One that follows lengths comes first, then one that follows speeds, which otherwise damps, then a motor.
     return min(
         actuators,
         key=lambda actuator: ([b != 0.0 for b in actuator.bias[1:]] + [True]).index(True),
@@ -253,7 +253,7 @@ def _take(model: Any, joint: int, *, keep: bool) -> _Actuator | None:
 
 
 def _actuator(model: Any, number: int) -> _Actuator:
-    """An actuator of a file; an InputError where it is none that can be driven here."""
+    """An actuator of a file; an InputError if it is none that can be driven here."""
     mj = mujoco()
     dyn = mj.mjtDyn
     taken = (dyn.mjDYN_NONE, dyn.mjDYN_INTEGRATOR, dyn.mjDYN_FILTER, dyn.mjDYN_FILTEREXACT)

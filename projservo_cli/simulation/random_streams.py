@@ -22,13 +22,13 @@ class NoiseShape(NamedTuple):
     """Distribution of the noise of pixels, of unit deviation but for outliers."""
 
     tail_dof: float = math.inf  # degrees of freedom of Student's t, above 2; infinite for a normal one
-    outlier_share: float = 0.0  # of the markers of an image
-    outlier_factor: float = 1.0  # deviation of outliers, over that of the others
+    outlier_share: float = 0.0  # share of outliers among the markers of an image
+    outlier_factor: float = 1.0  # deviation of outliers, over the deviation of the others
 
     def draw(self, rng: np.random.Generator, shape: tuple[int, ...]) -> FloatArray:
         """Noise (..., m, 2), of which fewer rows are the first of more.
 
-        Tails are those of t at the quantiles of the normal numbers, and outliers are of another stream, so
+        Tails follow t at the quantiles of the normal numbers, and outliers are of another stream, so
         that studies of several distributions share their draws.
         """
         noise = rng.standard_normal(shape)

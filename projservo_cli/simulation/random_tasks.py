@@ -13,7 +13,7 @@ from projservo_cli.simulation.arm import METRIC_A_INF
 from projservo_cli.simulation.ground_truth import Truth
 
 _RANGE = 0.9  # share of the range of a joint that is drawn from
-_LEAST_COSINE = math.cos(math.radians(75.0))  # of the angle between the normal of the face and a ray
+_LEAST_COSINE = math.cos(math.radians(75.0))  # minimum, of the angle between the normal of the face and a ray
 STRATA = 6
 """Equal parts of the range of rotations, of each of which there are as many tasks."""
 _BATCH = 2_000  # joint vectors drawn at once
@@ -25,14 +25,14 @@ def random_tasks(
     q_front: FloatArray,
     count: int,
     rng: np.random.Generator,
-    least_views: int = 0,
+    min_views: int = 0,
     angles: tuple[float, float] = (0.0, math.pi),
 ) -> tuple[FloatArray, FloatArray]:
     """Draw tasks within sight of the cameras, one of each sixth of a range of rotations in turn.
 
     q_front : (n,) joints at which the first camera sees the front of the face, rad or m.
-    least_views : number of cameras that see it at both ends, 0 for all.
-    angles : least and greatest rotation, rad.
+    min_views : number of cameras that see it at both ends, 0 for all.
+    angles : minimum and maximum rotation, rad.
     Returns joints (count, n) at start and goal, rad or m.
     """
     limits, (low, high) = truth.robot.limits, angles
@@ -53,8 +53,8 @@ def random_tasks(
         q = middle + half * rng.uniform(-1.0, 1.0, (_BATCH, len(middle)))
         drawn += _BATCH
         poses = _poses(truth, q)
-        shown = _accepted(truth, poses, front, least_views or len(truth.P))
-        waiting += [(q[i], poses[i, :3, :3]) for i in shown]
+        accepted = _accepted(truth, poses, front, min_views or len(truth.P))
+        waiting += [(q[i], poses[i, :3, :3]) for i in accepted]
         while len(waiting) >= 2:
             (start, R), (goal, R_goal) = waiting.pop(0), waiting.pop(0)
             angle = math.acos(min(1.0, max(-1.0, 0.5 * (float(np.trace(R.T @ R_goal)) - 1.0))))
@@ -86,11 +86,11 @@ def _cosines(truth: Truth, poses: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("kvi,ki->kv", rays, poses[:, :3, :3] @ normal))
 
 
-def _accepted(truth: Truth, poses: FloatArray, front: float, least_views: int) -> IntArray:
-    """Indices of the poses that show the face to so many cameras."""
+def _accepted(truth: Truth, poses: FloatArray, front: float, min_views: int) -> IntArray:
+    """Indices of the poses that show the face to enough cameras."""
     m = image_points(truth.P, truth.M_face @ np.swapaxes(poses, 1, 2))
     before = (m[..., 2] > 0.0).all(axis=2)
     facing = front * _cosines(truth, poses) >= _LEAST_COSINE
     pixels = m[..., :2] / np.where(m[..., 2:] > 0.0, m[..., 2:], np.nan)
     inside = within_images(pixels, truth.image_size[:, None]).all(axis=2)
-    return np.flatnonzero((before & facing & inside).sum(axis=1) >= least_views)
+    return np.flatnonzero((before & facing & inside).sum(axis=1) >= min_views)

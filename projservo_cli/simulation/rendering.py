@@ -27,19 +27,19 @@ _THICK, _THIN, _LEAST_LINK_M = 0.05, 0.03, 1e-3
 _LINK, _HOLDER = (0.75, 0.5, 0.25, 1.0), (0.3, 0.3, 0.3, 1.0)
 _PLATE_M, _ROD_M = 5e-4, 4e-3  # half the thickness of a tag, and of the rod that holds it
 _TOOL_DENSITY = 500.0  # kg/m³
-_SIDES = ("front", "back")  # of a plate: the tag, and what hides it from behind
-# Of the picture of a tag: where it has more pixels than the frame, edges along its rows are drawn a tenth of
+_SIDES = ("front", "back")  # sides of a plate: the tag, and its opaque back
+# Picture of a tag: where it has more pixels than the frame, edges along its rows are drawn a tenth of
 # a pixel off.
 _CELL_PX = 4
-# Inertia of rotors of joints without, kg m² or kg: at most, and as a share of that of the heaviest joint.
+# Inertia of rotors of joints without, kg m² or kg: at most, and as a share of the heaviest joint's.
 _ARMATURE, _ARMATURE_SHARE = 0.1, 0.05
 _SENSOR_M = 1e-5  # width of a pixel of a camera's sensor; only ratios to it matter
-_NO_SKEW = 1e-9  # of a camera's pixels, which rounding leaves
-_NEAR_M, _FAR_M = 0.01, 50.0  # what cameras see
-_WALL, _WALL_M = "far wall", 40.0  # what stands behind everything, and how far
+_NO_SKEW = 1e-9  # skew of a camera's pixels by rounding
+_NEAR_M, _FAR_M = 0.01, 50.0  # range of cameras
+_WALL, _WALL_M = "far wall", 40.0  # background, and its distance
 _FINER = 2
 """Pixels of a drawing along each of a frame: of one alone, edges are drawn up to a tenth of a pixel off."""
-_STILL = 1e-5  # rad or m: what joints move less in an exposure blurs nothing
+_STILL = 1e-5  # rad or m: smaller motions in an exposure cause no blur
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,28 +50,28 @@ class RenderedScene:
     P: FloatArray  # (V, 3, 4) cameras, px, from the base frame or, of those on the tool, from its frame
     size: tuple[int, int]  # width and height of the images, px
     tags: tuple[Tag, ...]
-    numbers: tuple[int, ...]  # of the markers, four corners a tag, those of objects last
-    dictionary: str  # of the tags
+    numbers: tuple[int, ...]  # numbers of the markers, four corners per tag, objects last
+    dictionary: str  # dictionary of the tags
     mjcf: File | None  # the model of the arm, with the files that it names; None for one of capsules
     tip: str  # body or site of the model that is the tool
     options: RenderedOptions
     view: tuple[str, ...] = VIEWS  # names of the views
-    on_tool: bool = False  # whether the cameras are on the tool, and the tags stand in the base frame
-    objects: tuple[Tag, ...] = ()  # further tags, which stand in the base frame
+    on_tool: bool = False  # whether the cameras are on the tool, and the tags are fixed in the base frame
+    objects: tuple[Tag, ...] = ()  # further tags, fixed in the base frame
 
 
 @dataclass(frozen=True, eq=False)
 class RenderedModel:
-    """A compiled model, and what in it stands for what."""
+    """A compiled model, and the meaning of its parts."""
 
     scene: RenderedScene
     finder: TagFinder
-    model: Any  # MjModel, which nobody changes
-    key: int  # of the keyframe that is its beginning, −1 for none
+    model: Any  # MjModel, which stays unchanged
+    key: int  # number of the keyframe that is its beginning, −1 for none
     joints: IntArray  # (n,) its joints of the arm, base to tool
     plates: tuple[tuple[int, ...], ...]  # for each tag the geoms that are its plate
-    margin: int  # by which drawings are wider at each side, px
-    tool: FloatArray  # (3, 3) rotation of the frame of the tags in that of the body that holds them
+    margin: int  # widening of drawings at each side, px
+    tool: FloatArray  # (3, 3) rotation of the frame of the tags in the frame of the body that holds them
 
     @property
     def positions(self) -> IntArray:
@@ -130,9 +130,9 @@ def rendered_model(scene: RenderedScene) -> RenderedModel:
     tip = next(body for body in spec.bodies if body.id == holder)
     # Tags and cameras: one on the tool, the other in the base frame.
     body, place = (spec.worldbody, np.eye(4)) if scene.on_tool else (tip, tool)
-    _add_tags(body, spec, place, scene.tags, finder, standing=scene.on_tool)
+    _add_tags(body, spec, place, scene.tags, finder, in_scene=scene.on_tool)
     if scene.objects:
-        _add_tags(spec.worldbody, spec, np.eye(4), scene.objects, finder, standing=True)
+        _add_tags(spec.worldbody, spec, np.eye(4), scene.objects, finder, in_scene=True)
     at_reference = np.linalg.inv(scene.arm.base_tool) if scene.on_tool else np.eye(4)
     _put_light(spec, scene.options.light, P @ at_reference)
     K, R, t = (np.array(parts) for parts in zip(*map(_decomposed, P), strict=True))
@@ -163,7 +163,7 @@ def _add_arm(spec: Any, arm: SerialArm) -> None:
     """Add an arm of capsules.
 
     Every body has the axes of the base at the reference, where joints have their readings; a link reaches
-    from the point of one joint's axis that is nearest to the link before to that of the next.
+    from the point of one joint's axis that is nearest to the link before to the point of the next.
     """
     mj = mujoco()
     spec.compiler.degree = False
@@ -206,15 +206,15 @@ def _name(tag: Tag, side: str) -> str:
 
 
 def _add_tags(
-    holder: Any, spec: Any, tool: FloatArray, tags: Sequence[Tag], finder: TagFinder, *, standing: bool
+    holder: Any, spec: Any, tool: FloatArray, tags: Sequence[Tag], finder: TagFinder, *, in_scene: bool
 ) -> None:
     """Hang tags on a body of a specification.
 
-    tool : (4, 4) pose of their frame in its own, m; standing : whether that is the frame of the base.
+    tool : (4, 4) pose of their frame in its own, m; in_scene : whether that is the frame of the base.
     """
     mj = mujoco()
-    body, origin = holder.add_body(name="scene with tags" if standing else "tool with tags"), tool[:3, 3]
-    if standing:  # rods meet behind the tags
+    body, origin = holder.add_body(name="scene with tags" if in_scene else "tool with tags"), tool[:3, 3]
+    if in_scene:  # rods meet behind the tags
         origin = np.mean(
             [np.array(tag.pose)[:3, 3] - tag.size_m * np.array(tag.pose)[:3, 2] for tag in tags], 0
         )
@@ -222,7 +222,7 @@ def _add_tags(
         spec.add_material(name="tag holder", rgba=_HOLDER, specular=0.0)
 
     def add(shape: Any, material: str, **values: Any) -> None:
-        """A geom that touches nothing, whatever the defaults of the file."""
+        """A geom without contacts, for any defaults of the file."""
         body.add_geom(
             type=shape, material=material, group=0, contype=0, conaffinity=0, density=_TOOL_DENSITY, **values
         )
@@ -353,22 +353,23 @@ class Frames:
         self._renderer: Any = None
 
     def open(self) -> None:
-        """Make ready to draw, in the thread that looks; an InputError says what to install for that."""
+        """Prepare to draw, in the drawing thread; an InputError names the packages to install."""
         mj, rendered = mujoco(), self.rendered
         height, width = self.last.shape[1] + 2 * rendered.margin, self.last.shape[2] + 2 * rendered.margin
         try:
             self._renderer = mj.Renderer(rendered.model, _FINER * height, _FINER * width)
-        except Exception as error:  # of another kind for each library of GL
+        except Exception as error:  # another class for each library of GL
             raise InputError(no_gl(error)) from error
         self._renderer.scene.flags[mj.mjtRndFlag.mjRND_SHADOW] = self._scene.options.light == "side"
-        self._renderer.scene.flags[mj.mjtRndFlag.mjRND_SKYBOX] = 0  # of a file: it takes longer than the rest
+        # a file's skybox takes longer than the rest
+        self._renderer.scene.flags[mj.mjtRndFlag.mjRND_SKYBOX] = 0
         self._model = copy.copy(rendered.model)
         self._data = rendered.begin(self._model, rendered.model.qpos0[rendered.positions])
         self._shown = mj.MjvOption()
         self._shown.sitegroup[:] = 0
 
     def close(self) -> None:
-        """Let go of what draws."""
+        """Release the renderer."""
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
@@ -411,7 +412,7 @@ class Frames:
         mj.mj_kinematics(self._model, self._data)
         mj.mj_camlight(self._model, self._data)
         self._renderer.update_scene(self._data, _camera_name(self._scene.view[view]), self._shown)
-        # Tags, their holder and light have no colour: green alone stands for grey.
+        # Tags, their holder and light have no colour: green alone gives grey.
         fine, cv = np.ascontiguousarray(self._renderer.render()[..., 1]), self._finder.cv
         if self._maps is not None:
             fine = cv.remap(fine, *self._maps[view], cv.INTER_LANCZOS4)

@@ -2,7 +2,7 @@
 
 Its time passes in ``command`` alone, so that its runs are the same to the bit wherever they are made. A servo
 goes to its set-point in a straight line by the time that is due, and holds there; it follows with a lag of
-first order, less what its load costs it. Beyond the encoder there are play, a slip and a link that flexes.
+first order, less the sag by its load. Beyond the encoder there are backlash, a slip and a link that flexes.
 Rolling shutters are not modelled.
 """
 
@@ -30,7 +30,7 @@ _GRID_S = 0.005
 _EXPOSED = 5  # instants of an exposure that are averaged
 _POSTURES = 500  # that are drawn to see how far an arm reaches
 _BEFORE = 2**20  # frames before the opening are numbered too
-_CLOCKS_S = 100.0  # how far clocks of cameras are off at most
+_CLOCKS_S = 100.0  # maximum offset of clocks of cameras
 
 
 class SimulatedRobot(NamedTuple):
@@ -39,7 +39,7 @@ class SimulatedRobot(NamedTuple):
     truth: Truth
     faults: Faults
     scene: RenderedScene | None  # before rendered cameras; None for cameras that see points
-    period: float  # of the loop, s
+    period: float  # period of the loop, s
     objects: tuple[SceneObject, ...] = ()  # that its cameras see, too
 
 
@@ -74,7 +74,7 @@ class Points(NamedTuple):
     see: Callable[[FloatArray, FloatArray], FloatArray]
     borders: bool
     sigma_px: float  # noise of a coordinate of each frame
-    standing: FloatArray = np.zeros((1, 0, 2))  # (V, k, 2) px of the markers of objects; NaN where unseen
+    fixed_pixels: FloatArray = np.zeros((1, 0, 2))  # (V, k, 2) px of the markers of objects; NaN where unseen
 
     def open(self) -> None:
         """Nothing is to be opened."""
@@ -94,8 +94,8 @@ class Points(NamedTuple):
             )
             M[self.truth.number.index(moved[0]), :3] += by
         mean_pixels = np.mean([self.see(joints, M)[view] for joints in q], axis=0)
-        if self.standing.size:
-            mean_pixels = np.concatenate([mean_pixels, self.standing[view]])
+        if self.fixed_pixels.size:
+            mean_pixels = np.concatenate([mean_pixels, self.fixed_pixels[view]])
         return np.asarray(mean_pixels + self.sigma_px * self.truth.noise.draw(rng, mean_pixels.shape)), None
 
 
@@ -114,7 +114,7 @@ class _Servos(Protocol):
         """Return the positions of the encoders (n,), rad or m."""
 
     def follow(self, setpoint: FloatArray, seconds: float) -> None:
-        """Let so much time pass, s, while the set-point goes evenly to joints (n,), rad or m."""
+        """Let ``seconds`` pass while the set-point goes evenly to joints (n,), rad or m."""
 
     def strike(self, by: FloatArray) -> None:
         """Move joints, and where they are sent, by (n,), rad or m, at once."""
@@ -126,10 +126,10 @@ class World(NamedTuple):
     truth: Truth
     q_start: FloatArray  # (n,) first readings, rad or m
     eyes: _Eyes
-    period: float  # of the loop, s
+    period: float  # period of the loop, s
     seed: int
-    stream: int  # of the random numbers of the seed
-    servos: _Servos | None = None  # at rest at q_start; None for those of first order
+    stream: int  # stream of the random numbers of the seed
+    servos: _Servos | None = None  # at rest at q_start; None for servos of first order
     eyes_later: _Eyes | None = None  # since an object moved
 
     def random(self, view: int, k: int) -> np.random.Generator:
@@ -160,10 +160,10 @@ def robot_of(
     if scene is None:
         later, moved = None, events.object_moved
         if objects:
-            points = points._replace(standing=_images_of(objects, truth))
+            points = points._replace(fixed_pixels=_images_of(objects, truth))
         if moved is not None:
             after = [one.displaced(moved) if one.name == moved.name else one for one in objects]
-            later = points._replace(standing=_images_of(after, truth))
+            later = points._replace(fixed_pixels=_images_of(after, truth))
         return FaultyRobot(World(truth, q_start, points, period, *drawn, eyes_later=later), faults, events)
     rendered = rendered_model(scene)
     servos = Physics(rendered, q_start, faults.servo_time_constant_s, math.radians(faults.gravity_sag_deg))
@@ -210,7 +210,7 @@ def _looked(
 class FaultyRobot:
     """A simulated robot of the contract.
 
-    world : the robot and its rig; faults : permanent ones; events : those of the run.
+    world : the robot and its rig; faults : permanent ones; events : of the run.
     ``view``: names of its views. ``taken``: (V,) true exposure times of the last frames, s, which no robot
     knows. ``frames``: (V, height, width) the last frames of rendered cameras; None of others.
     """
@@ -228,7 +228,7 @@ class FaultyRobot:
         self.world.eyes.open()
 
     def read(self) -> tuple[Any, ...]:
-        """Joint readings (n,), rad or m, and pixels (V, m, 2), with stamps and deviations where there are."""
+        """Joint readings (n,), rad or m, and pixels (V, m, 2), with stamps and deviations if there are."""
         now, q = self.now(), self._reading()
         frames = [camera.newest(now) for camera in self._cameras]
         self.taken[:] = [frame.middle for frame in frames]
@@ -241,7 +241,7 @@ class FaultyRobot:
         return (q, pixels, *stamps, np.stack(sigmas)) if sigmas else (q, pixels, *stamps)
 
     def command(self, target: FloatArray, speed: FloatArray, due: float) -> None:
-        """Go to joints (n,) by the time that is due, s; where none comes then, they are held."""
+        """Go to joints (n,) by the time that is due, s; if none comes then, they are held."""
         del speed
         self._joints.go(_whole(target, self._faults.quantize_setpoints * self._joints.tick), due)
 
@@ -250,13 +250,13 @@ class FaultyRobot:
         return self._joints.times[-1]
 
     def force(self) -> float:
-        """Greatest force on the arm since it was last asked for, N; 0 where nothing is in its way."""
+        """Greatest force on the arm since it was last asked for, N; 0 without an obstacle."""
         greatest, self._joints.force = self._joints.force, 0.0
         return greatest
 
     @property
     def frames(self) -> ByteArray | None:
-        """The last frames of the cameras as they were searched, where they are rendered."""
+        """The last frames of the cameras as they were searched, if they are rendered."""
         return self.world.eyes.last if isinstance(self.world.eyes, Frames) else None
 
     def truth(self) -> FloatArray:
@@ -313,7 +313,7 @@ def _step(time: float, period: float) -> int:
 class _FirstOrder:
     """Servos that follow with a lag of first order, with sag under the load of the tool."""
 
-    force = 0.0  # nothing is in the way
+    force = 0.0  # no obstacle
 
     def __init__(
         self, load: Callable[[FloatArray], FloatArray], q: FloatArray, lag_s: float, sag: float
@@ -323,7 +323,7 @@ class _FirstOrder:
         self.setpoint = self.motor - sag * load(self.motor)
 
     def follow(self, setpoint: FloatArray, seconds: float) -> None:
-        """Let so much time pass, s, while the set-point goes evenly to joints (n,), rad or m.
+        """Let ``seconds`` pass while the set-point goes evenly to joints (n,), rad or m.
 
         m' = (u - m) / lag has the solution m = u - v lag + (m_0 - u_0 + v lag) exp(-t / lag) where u goes at
         the pace v; the load of the posture is taken as constant meanwhile.
@@ -344,9 +344,9 @@ class _FirstOrder:
 class _Joints:
     """Servos, play and links over time.
 
-    ``servos``: what moves them. ``times, links``: every instant so far, s, and the true joints (n,) there.
-    ``tick``: (n,) of the encoders, 0 for none. All rad or m. ``force``: the greatest on the arm so far, N,
-    which whoever asks sets back.
+    ``servos``: their actuators. ``times, links``: every past instant, s, and the true joints (n,) there.
+    ``tick``: (n,) step of the encoders, 0 for none. All rad or m. ``force``: the greatest on the arm until
+    now, N, which whoever asks sets back.
     """
 
     def __init__(self, world: World, faults: Faults, moved: JointMoved | None) -> None:
@@ -357,7 +357,7 @@ class _Joints:
             2.0 * math.pi / faults.encoder_counts_per_turn if faults.encoder_counts_per_turn else 0.0
         )
         self._play = 0.5 * math.radians(faults.backlash_deg) * scale
-        # What gravity costs a joint that holds the tool at full reach, rad.
+        # Sag by gravity of a joint that holds the tool at full reach, rad.
         sag, self._flex = math.radians(faults.gravity_sag_deg), math.radians(faults.link_deflection_deg)
         self._loaded = sag > 0.0 or self._flex > 0.0
         self._reach = full_reach(self.arm) if self._loaded else 1.0
@@ -379,7 +379,7 @@ class _Joints:
             self._advance(time, self.servos.setpoint + share if left > 1 else target)
 
     def at(self, time: float) -> FloatArray:
-        """True joints (n,) at a time so far, s; before the opening they stood still."""
+        """True joints (n,) at a past time, s; before the opening they were at rest."""
         i = bisect.bisect_right(self.times, time)
         if i == 0 or i == len(self.times):
             return self.links[max(0, i - 1)]
@@ -419,7 +419,7 @@ class _Joints:
 class _Frame(NamedTuple):
     """An image."""
 
-    middle: float  # of its exposure, s
+    middle: float  # middle of its exposure, s
     stamp: float  # the same by the clock of the camera
     pixels: FloatArray  # (m, 2), NaN where unseen
     sigma: FloatArray | None  # (m,) their deviations, px, if they are known
@@ -470,7 +470,7 @@ class _Camera:
         many = _EXPOSED if self._faults.exposure_s else 1
         times = middle + self._faults.exposure_s * ((np.arange(many) + 0.5) / many - 0.5)
         rng = world.random(self._view, _BEFORE + k)
-        rng.standard_normal()  # that of the jitter
+        rng.standard_normal()  # random number of the jitter
         q = np.array([self._joints.at(t) for t in times])
         eyes = world.eyes
         if (shifted := events.object_moved) is not None and step >= shifted.at_step:
@@ -486,6 +486,6 @@ class _Camera:
 
 
 def obstruction_of(robot: object) -> tuple[Finding, ...]:
-    """Return what obstructs an arm, where its simulation knows it."""
+    """Return what obstructs an arm, if its simulation knows it."""
     servos = robot.world.servos if isinstance(robot, FaultyRobot) else None
     return servos.obstruction if isinstance(servos, Physics) else ()

@@ -1,6 +1,6 @@
 """URDF import: the joint screws of an arm that a URDF describes, read by its XML alone.
 
-An arm is what ``robot.screws`` takes: the joint screws at a reference and the pose of a tip there.
+An arm is given as in ``robot.screws``: the joint screws at a reference and the pose of a tip there.
 """
 
 import math
@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from projservo_cli.records import FloatArray, InputError
 
 _MOVING = {"revolute": "R", "continuous": "R", "prismatic": "P"}
-_MACRO = ("${", "$(")  # marks of what xacro replaces in attributes
+_MACRO = ("${", "$(")  # marks of xacro expressions in attributes
 
 
 def read_urdf(path: str, tip: str, content: bytes) -> dict[str, Any]:
@@ -109,7 +109,7 @@ def _tree(path: str, content: bytes) -> tuple[list[str], dict[str, ET.Element]]:
     for kind, names in (("link", links), ("joint", joints)):
         if twice := [name for name in dict.fromkeys(names) if names.count(name) > 1]:
             count = names.count(twice[0])
-            raise InputError(f"{path}: {kind} {twice[0]} stands there {count} times: keep one")
+            raise InputError(f"{path}: {kind} {twice[0]} occurs {count} times: keep one")
     above: dict[str, ET.Element] = {}
     for joint in root.findall("joint"):
         link = _link(joint, "child", path)
@@ -129,11 +129,11 @@ def _tree(path: str, content: bytes) -> tuple[list[str], dict[str, ET.Element]]:
 
 
 def _parsed(path: str, content: bytes) -> ET.Element:
-    """The outermost element of a URDF, in whatever encoding the file declares."""
+    """The outermost element of a URDF, in the encoding that the file declares."""
     try:
         try:
             root = ET.fromstring(content)
-        except ValueError:  # of several bytes a character, which the parser leaves to its caller
+        except ValueError:  # encodings of several bytes, which the parser leaves to its caller
             declared = re.search(rb"""encoding\s*=\s*["']([\w.:-]+)""", content[:200])
             root = ET.fromstring(content.decode(declared[1].decode() if declared else "utf-8"))
     except (ET.ParseError, LookupError, ValueError) as error:

@@ -1,7 +1,7 @@
 """Speed of control steps and whole runs, relative to one SVD of NumPy in the same process.
 
 Everything is timed in turn, round by round, in pieces of about a millisecond. Ratios are between the
-minimum times, which a busy machine disturbs least.
+minimum times, which a busy machine hardly disturbs.
 """
 
 import itertools
@@ -91,7 +91,7 @@ class Case:
 
 
 def timings(case: Case, rounds: int = ROUNDS) -> dict[str, Any]:
-    """Time everything so many rounds; see the schema of ``projservo bench --json``."""
+    """Time all for a number of rounds; see the schema of ``projservo bench --json``."""
     matrices = itertools.cycle(np.random.default_rng(0).standard_normal((STATES, 8, 6)))
     whole, log = case.whole_run(), case.points.log
     timed: dict[str, tuple[Callable[[], object], int]] = {
@@ -108,7 +108,8 @@ def timings(case: Case, rounds: int = ROUNDS) -> dict[str, Any]:
     table = 1e6 * np.array(found).T
     quartiles = np.percentile(table, [0, 25, 50, 75], axis=1)
     rows = np.vstack([quartiles, quartiles[0] / quartiles[0, 0]]).T.tolist()
-    keys = ("least", "lower", "median", "upper", "over_svd")  # µs, and the minimum over that of one SVD
+    # µs, and the minimum over the minimum of one SVD
+    keys = ("least", "lower", "median", "upper", "over_svd")
     times = {name: dict(zip(keys, row, strict=True)) for name, row in zip(timed, rows, strict=True)}
     return {
         "step_over_svd": max(times["direct_three"]["over_svd"], times["direct_two"]["over_svd"]),

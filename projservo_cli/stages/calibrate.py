@@ -148,7 +148,7 @@ def estimate(
             held_out.append(found)
 
     def fitted_to(observation: Observation) -> Calibration:
-        """Calibrate from observations with the inputs that are asked for."""
+        """Calibrate from observations with the given inputs."""
         return calibrate(
             observation,
             seen.joint_types,
@@ -194,7 +194,7 @@ def estimate(
 def suggest_motions(
     inputs: SuggestionInputs, observation: Observation, calibration: Calibration, count: int, path: Path
 ) -> tuple[Suggestion, ...]:
-    """Write poses that reduce the variance of predictions most, within the joint limits where they are known.
+    """Write poses that reduce the variance of predictions most, within the joint limits if they are known.
 
     Predictions are judged over the range of the recorded readings, a little widened. Candidates lie in
     the same range, or for a simulated robot in one three times as wide. ``path`` becomes a list of motions, a

@@ -1,4 +1,4 @@
-"""The objects that a goal was taught on: looked at anew, and the goal carried along."""
+"""Objects that a goal was taught on: located again, and the goal carried along."""
 
 import math
 from collections.abc import Sequence
@@ -43,10 +43,10 @@ def in_metres(calibration: Calibration, known: KnownLengths) -> tuple[Metric | N
 def carried_by(
     scenario: Scenario, carriers: Sequence[CarryingObject], before: Plan | None, session: Session | None
 ) -> tuple[CarriedByObject, ...]:
-    """Look at objects anew, and carry the goal along with each.
+    """Locate objects again, and carry the goal along with each.
 
     before : plan to the same goal from elsewhere, for which they were looked at; None to look now.
-    session : connection to the robot that looks; None for one of its own.
+    session : connection to the robot that looks; None to open one.
     Raises WorkFailed where images do not show an object or the goal well enough.
     """
     if before is not None and before.carried:
@@ -55,7 +55,7 @@ def carried_by(
 
 
 def _carried(scenario: Scenario, carrier: CarryingObject, session: Session | None) -> CarriedByObject:
-    """Look at an object anew, and carry the goal along with it; arguments as above."""
+    """Locate an object again, and carry the goal along with it; arguments as above."""
     c = scenario.world.calibration
     metric, _ = in_metres(c, carrier.lengths)
     taught, now = scenario.world.observe_object(carrier, session, scenario.exact, scenario.q_taught)
@@ -95,8 +95,8 @@ def markers_now(c: Calibration, carried: CarriedByObject) -> UncertainPoints:
     """Return the markers of an object of a plan where it is now."""
     numbers, taught = carried.object_marker.tolist(), carried.s_object_taught
     assert taught is not None
-    looks = [ObjectView(taught), ObjectView(carried.s_object, carried.sigma_object)]
-    return DisplacedObject.of(c, numbers, looks).markers_now(numbers)
+    observed = [ObjectView(taught), ObjectView(carried.s_object, carried.sigma_object)]
+    return DisplacedObject.of(c, numbers, observed).markers_now(numbers)
 
 
 def _in_body(found: DisplacedObject, H: FloatArray, numbers: Sequence[int]) -> FloatArray:
@@ -107,7 +107,7 @@ def _in_body(found: DisplacedObject, H: FloatArray, numbers: Sequence[int]) -> F
 
 
 def too_far(carried: CarriedByObject, carrier: CarryingObject) -> Finding | None:
-    """Return why somebody should look before a robot goes to a carried goal; None if that is not needed."""
+    """Return the reason to check a carried goal before the robot goes there; None if there is none."""
     limits, subject = carrier.objects, Subject(name=carrier.name)
     for at, most, unit in (
         (carried.object_shift_mm and 1e-3 * carried.object_shift_mm, limits.max_displacement_m, "m"),

@@ -35,18 +35,18 @@ _LOOK_S, _MIN_LOOKS = 1.5, 8
 
 
 class Checked(NamedTuple):
-    """Findings on a robot and its cameras, and what they rest on."""
+    """Findings on a robot and its cameras, and their data."""
 
     findings: tuple[Finding, ...]
     seen: RobotAtRest | None  # None where robot or cameras did not open
-    moved: tuple[Strokes, ...]  # of the joints that were moved
+    moved: tuple[Strokes, ...]  # strokes of the joints that were moved
     refit: tuple[str, RefitPoses] | None = None  # camera that moved, and poses to fit it again from
 
     setup: Setup = Setup()  # the arm and its cameras
 
     @property
     def works(self) -> bool:
-        """Whether nothing stands against a recording."""
+        """Whether no finding prevents a recording."""
         return usable(self.findings)
 
     @property
@@ -56,7 +56,7 @@ class Checked(NamedTuple):
 
     @property
     def refuted(self) -> str | None:
-        """Reason why the calibration holds no more, empty where it does; None where it was not compared."""
+        """Reason why the calibration holds no more, empty if it does; None if it was not compared."""
         for one in self.findings:
             if one.code in ("agrees", "refuted"):
                 return "" if one.code == "agrees" else messages.sentence(one, self.setup)
@@ -72,9 +72,9 @@ def check(
 ) -> Checked:
     """Open robot and cameras, look, and close them.
 
-    calibration : whose images are compared, where there is one, and whose data may give limits.
-    confirmed : asks whether joints may be moved, by so much to either side in words; None moves none.
-    watch : is called with the open robot, for as long as somebody wants to see its images.
+    calibration : whose images are compared, if there is one, and whose data may give limits.
+    confirmed : asks whether joints may be moved, by a distance in words; None moves none.
+    watch : is called with the open robot, until the user has seen its images.
     """
     joints, dictionary = inputs.joints.joints("", calibration), inputs.dictionary or DICTIONARY
     assert isinstance(inputs.driven.robot, OwnRobot)
@@ -124,26 +124,26 @@ def _move_joints(robot: PluginRobot, moved: list[Strokes], progress: Progress) -
 
 
 def _seen(robot: PluginRobot, inputs: PreflightInputs, progress: Progress) -> RobotAtRest:
-    """Look for a while at a robot that stands where it is."""
+    """Observe a robot at rest for a while."""
     period, readings = robot.bounds.period, [robot.read()]
     wanted = max(_MIN_LOOKS, round(_LOOK_S / period))
     while len(readings) < wanted:
         time.sleep(period)
         readings.append(robot.read())
         progress("look", len(readings), wanted)
-    shown, fresh = observation_of_frames(readings, np.array(inputs.numbers, dtype=np.int64))
-    s, scatter = zip(*(_mean(shown.images[new, v]) for v, new in enumerate(fresh.T)), strict=True)
+    frames, fresh = observation_of_frames(readings, np.array(inputs.numbers, dtype=np.int64))
+    s, scatter = zip(*(_mean(frames.images[new, v]) for v, new in enumerate(fresh.T)), strict=True)
     own, cameras, views = robot.robot, list[VideoCamera](), list[View]()
     if isinstance(own, CameraRobot):
         cameras, views = own.cameras, [view for view in own.views if view is not None]
     return RobotAtRest(
         marker=inputs.numbers,
         face=inputs.markers.front or (),
-        q=np.mean([look.q for look in readings], axis=0),
+        q=np.mean([observation.q for observation in readings], axis=0),
         s=np.stack(s),
         sigma=readings[-1].sigma_px,
         scatter=np.stack(scatter),
-        shown=shown,
+        frames=frames,
         fresh=fresh,
         limits=robot.bounds.limits,
         units=robot.bounds.units,
@@ -169,35 +169,35 @@ def calibration_finding(
     lengths: FloatArray,
     noise_px: float = 0.0,
 ) -> Finding:
-    """Whether images at rest still agree with a calibration, and what changed if they do not.
+    """Whether images at rest still agree with a calibration, and the change if they do not.
 
     lengths : (f, f) between the markers of the face, m, NaN if unknown; noise_px : of the images of a run.
     """
     if not calibration.usable:
         return Finding("unusable_calibration", LIMITS)
     size = image_sizes(image_size or at_rest.frame_sizes, calibration.view)
-    marker = at_rest.shown.marker
+    marker = at_rest.frames.marker
     if not np.isfinite(at_rest.s[:, np.isin(marker, calibration.marker)]).any():
         return Finding("uncompared", LIMITS)
-    if fault := fault_at_rest(calibration, at_rest.shown, size, sigma_px=noise_px, fresh=at_rest.fresh):
+    if fault := fault_at_rest(calibration, at_rest.frames, size, sigma_px=noise_px, fresh=at_rest.fresh):
         views = _view_errors(calibration, at_rest)
-        told_of = (one.finding for one in views if any(view.disagrees for view in views))
-        return Finding("refuted", REFUSES, others=(fault, *told_of))
+        reasons = (one.finding for one in views if any(view.disagrees for view in views))
+        return Finding("refuted", REFUSES, others=(fault, *reasons))
     images = at_known_markers(calibration, marker, at_rest.s)
     mm = resting_error_mm(calibration, at_rest.q, at_rest.face, lengths, images)
     return Finding("agrees", NOTE, amount=math.nan if mm is None else 1e-3 * mm, unit="m")
 
 
 def _view_errors(calibration: Calibration, at_rest: RobotAtRest) -> list[ViewError]:
-    """How far the images of each view are off that are seen at all."""
-    look = Observation.of_one(at_rest.shown.marker, at_rest.q, at_rest.s, calibration.view)
-    return [one for one in view_errors(calibration, look) if np.isfinite(one.off_px)]
+    """Errors of the images of each view that has any."""
+    observation = Observation.of_one(at_rest.frames.marker, at_rest.q, at_rest.s, calibration.view)
+    return [one for one in view_errors(calibration, observation) if np.isfinite(one.off_px)]
 
 
 def mended_by_refit(
     finding: Finding, calibration: Calibration, at_rest: RobotAtRest, image_size: ImageSize | None
 ) -> tuple[tuple[Finding, ...], tuple[str, RefitPoses] | None]:
-    """Where one camera alone is off, poses to fit it again from; nothing else."""
+    """Yield poses to fit a camera again from, if it alone is wrong."""
     views = _view_errors(calibration, at_rest) if finding.severity == REFUSES else []
     moved = [one.view for one in views if one.disagrees]
     # A joint that slipped, a tag that moved and exchanged cameras show in other views too, if there are any.

@@ -85,7 +85,7 @@ def _partitioned(
 
 
 def _joint_motions(state: State) -> FloatArray:
-    """Joint motions t, r, p (3, n) of a partitioned task; zero where the joints are singular."""
+    """Joint motions t, r, p (3, n) of a partitioned task; zero if the joints are singular."""
     work = state.work
     if len(work.span.H_hat) == 0:
         return state.q_hat[:3].copy()
@@ -94,7 +94,7 @@ def _joint_motions(state: State) -> FloatArray:
     return np.asarray(q_hat.T if rank == min(J.shape) else np.zeros_like(q_hat.T))
 
 
-# What noise and calibration may leave of images that the joints can reach, px rms per marker and view.
+# Residual by noise and calibration of images that the joints can reach, px rms per marker and view.
 _LEFT_PX = 3.0
 _STAGES = 20  # instants of the plan at which the joints are sought
 # Distance of a marker of the face from its plane, over its size, that noise of the calibration may show.
@@ -130,8 +130,8 @@ def run(
 ) -> Plan:
     """Partition the task and plan its motion, from the calibration and the images alone.
 
-    before : plan to the same goal from elsewhere, whose look at an object holds; None to look anew.
-    session : connection to the robot that looks; None for one of its own.
+    before : plan to the same goal from elsewhere, whose location of an object holds; None to locate it again.
+    session : connection to the robot that observes; None to open one.
     Raises InputError if the task is missing; WorkFailed if it cannot be partitioned.
     """
     known = set(calibration.marker.tolist())
@@ -158,7 +158,7 @@ def run(
 
 
 def _plan_in(scenario: Scenario) -> Plan:
-    """Plan the task of a scenario as its trajectory is asked for; raises as ``plan_task``."""
+    """Plan the task of a scenario as its trajectory is configured; raises as ``plan_task``."""
     asked = scenario.world.inputs.trajectory
     search = search_of(scenario) if asked.needs_covariance else None
     return plan_task(scenario.world.model, scenario.ends, asked, scenario.demands, search)
@@ -169,9 +169,9 @@ _GOALS = 6
 
 
 def _to_any_goal(scenario: Scenario) -> Plan:
-    """Plan to the first of the goals of all incidences that a feasible motion reaches, else to the best one.
+    """Plan to the first goal of all incidences that a feasible motion reaches, otherwise to the best one.
 
-    Raises WorkFailed where no joints meet all incidences, with those that fail, or no motion leads to a goal.
+    Raises WorkFailed if no joints meet all incidences, with those that fail, or no motion leads to a goal.
     """
     model, ends = scenario.world.model, scenario.ends
     H_taught, shows = ends.displacements_taught(model), np.isfinite(ends.s_star[..., 0])
@@ -227,7 +227,7 @@ def _borders(inputs: PlanInputs, view: Sequence[str]) -> Iterator[Finding]:
 
 
 def _uneven(face: FloatArray) -> Iterator[Finding]:
-    """Tell how far markers (m, 3) of a face are off the plane that motions take it for."""
+    """Report the distance of markers (m, 3) of a face from the plane that motions assume."""
     size = np.linalg.svd(face - face.mean(axis=0))[1]
     if (share := float(size[2] / size[0])) > _UNEVEN:
         yield Finding("uneven_face", LIMITS, amount=share, limit=_UNEVEN)
@@ -254,8 +254,8 @@ def _require_taught_since(scenario: Scenario, calibration: Calibration) -> None:
     stated = images.sigma_px(scenario.world.numbers[: scenario.world.m], scenario.world.inputs.face)
     sigma = scenario.world.noise_px if stated is None else stated
     known, near_px = np.isin(numbers, calibration.marker), max(NEAR_PX, 2.0 * sigma)
-    shown = numbers[known].tolist(), seen[:, known]
-    q, median = joints_showing(calibration, *shown, scenario.exact.q_start, near_px)
+    seen_markers = numbers[known].tolist(), seen[:, known]
+    q, median = joints_showing(calibration, *seen_markers, scenario.exact.q_start, near_px)
     enough, fit = len(q) >= COORDINATES, rigid_fit(calibration, q, *whole)
     if enough and median > near_px:
         raise failed([Finding("goal_out_of_reach", REFUSES, amount=fit.moved_px, limit=near_px, unit="px")])
@@ -284,7 +284,7 @@ CHANGED = "the goal was taught after a change since the calibration"
 
 
 def _require_rigid(fit: RigidFit, setup: Setup, advice: str) -> None:
-    """Refuse goal images of which chance does not explain what the nearest pose of the tool leaves."""
+    """Refuse goal images whose residual at the nearest pose of the tool exceeds chance."""
     if not fit.agrees:
         of = Subject(views=(setup.view[fit.view],))
         shift = tuple(Finding("shift", amount=x, unit="px") for x in fit.shift) * (len(setup.view) > 1)
@@ -305,7 +305,7 @@ def plan_task(
     demands : constraints of the motion; profiles of the paper are only measured against them.
     search : inputs of a search through joint space, for the profiles ``joint_space`` and ``auto``.
     Raises WorkFailed if a marker cannot be triangulated, a motion is not unique or the joints would be too
-    fast; InputError for the profile ``joint_space`` where a joint has no speed limit.
+    fast; InputError for the profile ``joint_space`` if a joint has no speed limit.
     """
     if trajectory.profile != "auto":
         return _planned(model, images, trajectory, demands, search)[0]
@@ -366,8 +366,8 @@ def _minimum_of(motion: Motion) -> tuple[FloatArray, FloatArray]:
     along = motion.along
     best = best_views(motion.reaching.demands, along.visibility, along.distance)
     constraints = [best[0].min(axis=1), best[1].min(axis=1), along.limit, along.condition]
-    instants = [0 if np.isnan(column).all() else int(np.nanargmin(column)) for column in constraints]
-    return np.array([column[i] for column, i in zip(constraints, instants, strict=True)]), motion.mu[instants]
+    worst = [0 if np.isnan(column).all() else int(np.nanargmin(column)) for column in constraints]
+    return np.array([column[i] for column, i in zip(constraints, worst, strict=True)]), motion.mu[worst]
 
 
 def _motion_of(found: Found) -> PlannedMotion:
@@ -485,7 +485,7 @@ def _planned(
 
 
 def _changes(a: FloatArray, H_hat: FloatArray, task: Task) -> tuple[FloatArray, FloatArray]:
-    """τ_0 (V,) and θ_0± (V, 2) of the cameras; NaN where a motion never changes visibility."""
+    """τ_0 (V,) and θ_0± (V, 2) of the cameras; NaN if a motion never changes visibility."""
     tau_0 = [visibility_translation(a, H_hat[0], O) for O in task.O]
     theta_0 = [visibility_angles(a, H_hat[1], O) for O in task.O]
     return (

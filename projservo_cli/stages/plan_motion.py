@@ -49,7 +49,7 @@ class Found(NamedTuple):
 
     judged: Motion  # where the constraints were looked at
     motion: Motion  # as it is stored, at the instants sigma
-    time: FloatArray  # (s,) when it is there, s; NaN where nothing limits the speed
+    time: FloatArray  # (s,) when it is there, s; NaN if nothing limits the speed
     findings: tuple[Finding, ...]  # whether it may be followed; a path has its own
     path: JointPath | None = None  # through joint space, if one was searched
     entered: Finding | None = None  # the region that it enters and is to keep out of
@@ -98,7 +98,7 @@ def search_of(scenario: Scenario) -> JointSearch:
         world.m,
         (tuple(demands.limits.lower), tuple(demands.limits.upper), tuple(map(tuple, demands.image_size))),
         world.inputs.trajectory.search.seed,
-        scenario.world.least_views,
+        scenario.world.min_views,
     )
     closed = None if world.knows_limits else Finding("unknown_limits", REFUSES)
     return JointSearch(scenario.joints_at_goal, scenario.goal_sigma_px, spread, closed)
@@ -115,7 +115,7 @@ def why_closed(model: Model, demands: Demands, search: JointSearch | None) -> Fi
 def _timed(shortest: FloatArray, sigma: FloatArray, trajectory: Trajectory) -> FloatArray:
     """Time (s,) of a motion: its shortest time, from rest to rest, stretched to the duration it is given.
 
-    Where nothing limits the speed, the path parameter sigma (s,) passes evenly but for the ramps.
+    If nothing limits the speed, the path parameter sigma (s,) passes evenly but for the ramps.
     """
     duration, ramp = trajectory.duration_s, trajectory.acceleration_time_s
     eased = _from_rest(shortest, ramp)
@@ -138,7 +138,7 @@ def _require_time(duration: float, min_duration: float) -> None:
 
 
 def _from_rest(time: FloatArray, ramp: float) -> FloatArray:
-    """Times (s,) of a motion that comes up to its pace evenly in so many s, and so to rest again at its end.
+    """Times (s,) of a motion that accelerates evenly for a time, s, and decelerates likewise.
 
     The pace, seconds of ``time`` a second, is a trapezoid, of a short motion a triangle of the same slope:
     the motion never is faster, and takes longer by the ramp.
@@ -175,7 +175,7 @@ def _joint_constraints(reaching: Reaching, task: Task, trajectory: Trajectory, s
 
 
 def _entered(c: Constraints, q: FloatArray) -> Finding | None:
-    """Return the region that the body enters along joints (s, n); None where it keeps out of all."""
+    """Return the region that the body enters along joints (s, n); None if it keeps out of all."""
     if not np.isfinite(q).all():
         return Finding("not_followed", REFUSES)
     for end, joints in (("start", q[0]), ("goal", q[-1])):
@@ -194,7 +194,7 @@ def kept_out(found: Found, task: Task, trajectory: Trajectory, spread: Spread) -
 
 
 def joint_path(reaching: Reaching, task: Task, trajectory: Trajectory, search: JointSearch) -> Found:
-    """A path through joint space; the linear motion where there is none."""
+    """A path through joint space; the linear motion if there is none."""
     c = _joint_constraints(reaching, task, trajectory, search.spread)
     target = GoalFeatures(task.A_star, undistort(reaching.model.lens, task.s_star), search.sigma)
     how = SearchLimits(
@@ -216,7 +216,7 @@ def joint_path(reaching: Reaching, task: Task, trajectory: Trajectory, search: J
 
 
 def _sampled_path(reaching: Reaching, timed: TimedPath, samples: int) -> Motion:
-    """The motion at so many places even in time, or more where joints between them were too far off."""
+    """The motion at places evenly spaced in time, with more where joints between them err too much."""
     while True:
         q = joints_at(timed, np.linspace(0.0, float(timed.time[-1]), 2 * samples - 1))
         found, between = along_joints(reaching, q[::2]), 0.5 * (q[:-2:2] + q[2::2])
@@ -244,12 +244,12 @@ class PathReplanner:
         self._goal = GoalFeatures(task.A_star, undistort(model.lens, task.s_star), self._search.sigma)
 
     def predicted(self, q: FloatArray) -> FloatArray:
-        """Pixels (V, b, 2) of the body at joints (n,), by the calibration, those of the face first."""
+        """Pixels (V, b, 2) of the body at joints (n,), by the calibration, the face first."""
         model = self._c.model
         return project(model.P, self._c.M @ forward_kinematics(model, q).T, model.lens)
 
     def leaves(self, q: FloatArray, off: FloatArray) -> bool:
-        """Whether a path of joints (s, n) leaves an image, where images are off by (s, V, 2), px."""
+        """Whether a path of joints (s, n) leaves an image, if images err by (s, V, 2), px."""
         for joints, px in zip(q, off, strict=True):
             P = self._c.model.P.copy()
             P[:, :2] += px[:, :, None] * P[:, 2:]
@@ -259,7 +259,7 @@ class PathReplanner:
         return False
 
     def replan(self, q: FloatArray, excluded: FloatArray, off: FloatArray) -> Plan | None:
-        """Plan of a path from joints (n,), off by (V, 2) px, to other goals than those excluded (k, n).
+        """Plan of a path from joints (n,), with image errors (V, 2), px, to goals not excluded (k, n).
 
         It keeps that much farther from borders and regions. Each search has its own seed.
         """

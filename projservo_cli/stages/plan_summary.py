@@ -28,7 +28,7 @@ from projservo_cli.records import FloatArray, IntArray, JointSpaceSearch
 def verdict_of(motion: Motion) -> tuple[str, Finding]:
     """Return the constraint of a motion that is nearest to failing, and the finding on it, which may refuse.
 
-    Nearest is the smallest share of the margin at the worse of both ends; where a constraint fails, the
+    Nearest is the smallest share of the margin at the worse of both ends; if a constraint fails, the
     finding is on the first instant at which it does.
     """
     shares = motion.shares()
@@ -72,16 +72,16 @@ def _at_instant(motion: Motion, constraint: int, instant: int) -> Finding:
 
 
 def sight_of(profile: str, motion: Motion) -> Finding:
-    """Tell whether enough cameras see the face all along: the finding refuses where they do not."""
+    """Tell whether enough cameras see the face all along: the finding refuses if they do not."""
     margins, demands = motion.along.visibility, motion.reaching.demands
-    view, least = demands.view, demands.least_views or len(demands.view)
-    margins = np.where(np.argsort(np.argsort(-margins, axis=1), axis=1) < least, margins, np.inf)
+    view, min_seen = demands.view, demands.min_views or len(demands.view)
+    margins = np.where(np.argsort(np.argsort(-margins, axis=1), axis=1) < min_seen, margins, np.inf)
     sigma = np.linspace(0.0, 1.0, len(margins))
     if margins.min() > 0.0:
         instant, worst = np.unravel_index(np.argmin(margins), margins.shape)
         at = Finding("share", amount=float(sigma[instant]))
         subject = Subject(views=(view[worst],))
-        return Finding("face_seen", NOTE, subject, float(margins.min()), limit=least, others=(at,))
+        return Finding("face_seen", NOTE, subject, float(margins.min()), limit=min_seen, others=(at,))
     lost = tuple(
         Finding("share", subject=Subject(views=(name,)), amount=float(sigma[np.argmax(each <= 0)]))
         for name, each in zip(view, margins.T, strict=True)
@@ -97,7 +97,7 @@ _TOLD = 2
 
 
 def search_summary(path: JointPath, q: FloatArray, time: FloatArray, seed: int) -> JointSpaceSearch:
-    """What a search came to, with joints (s, n) at times (s,); NaN where it found none."""
+    """Result of a search, with joints (s, n) at times (s,); NaN if it found none."""
     trees = path.trees or ()
     tree_q, tree_parent = _stored(path.trees) if path.trees is not None else (None, None)
     margins, required, blends = None, None, None
@@ -153,16 +153,16 @@ def relaxed(path: JointPath, q: FloatArray, view: Sequence[str]) -> Iterator[Fin
 
 
 def _required(c: Constraints, q: FloatArray, margin: int, asked: float, view: Sequence[str]) -> Finding:
-    """Return what a margin is still required to be."""
+    """Return the requirement of a margin after relaxation."""
     if margin != JOINTS:
         return replace(_of_margin(margin, view), amount=float(asked), limit=float(c.full[margin]), unit="px")
     i = int(np.argmin(np.minimum(q - c.limits.lower, c.limits.upper - q) / c.keep))
-    least, unit = float(c.keep[i]), "m" if c.model.prismatic[i] else "rad"
-    return replace(_of_margin(margin, view, i + 1), amount=float(asked) * least, limit=least, unit=unit)
+    min_seen, unit = float(c.keep[i]), "m" if c.model.prismatic[i] else "rad"
+    return replace(_of_margin(margin, view, i + 1), amount=float(asked) * min_seen, limit=min_seen, unit=unit)
 
 
 def findings_on(path: JointPath, view: Sequence[str]) -> Finding:
-    """Return what a search through joint space found, or why it found no path; ``view`` names the views."""
+    """Return the result of a search through joint space, or its failure; ``view`` names the views."""
     if path.timing is None:
         return replace(_why_no_path(path, view), severity=REFUSES)
     g = int(np.abs(path.goals - path.corners[-1]).max(axis=1).argmin())
@@ -184,8 +184,8 @@ def _why_no_path(path: JointPath, view: Sequence[str]) -> Finding:
         what = Finding("margin_limits") if worst == JOINTS else _stopped(path, worst, view)
         return Finding("start_beyond", others=(what,))
     failed = path.failures[: len(path.start_clearance)]
-    most = [int(i) for i in np.argsort(-failed, kind="stable")[:_TOLD] if failed[i] > 0]
-    stopped = tuple(_stopped(path, i, view) for i in most)
+    frequent = [int(i) for i in np.argsort(-failed, kind="stable")[:_TOLD] if failed[i] > 0]
+    stopped = tuple(_stopped(path, i, view) for i in frequent)
     return Finding("no_path", amount=len(path.goals), limit=path.draws, others=stopped)
 
 

@@ -56,20 +56,20 @@ _DRAWS, _SHRINKING, _LEAST_SEEN, _LEAST_FACING = 100, 0.98, 0.75, 0.5
 class _Recording:
     """A table in the making."""
 
-    path: Path  # of the table
+    path: Path  # path of the table
     key: str  # the plant, and a hash of the inputs of the pixels; stored with every row
     targets: FloatArray  # (K, n) joints to drive to, rad or m; the row is the number of the pose
     marker: IntArray  # (m,) numbers of the markers
     done: dict[int, Reading] = field(default_factory=dict)  # the poses that are done
-    # Frames in motion towards poses that are done, by the number of the motion: that of the pose, from 1.
+    # Frames in motion towards poses that are done, by the number of the motion, which is the pose's, from 1.
     motion_readings: dict[int, list[Reading]] = field(default_factory=dict)
     found: int = 0  # how many of them an earlier call recorded
-    identity: str = ""  # of the robot that recorded them
+    identity: str = ""  # identity of the robot that recorded them
     view: tuple[str, ...] = VIEWS  # names of its views
-    mount: str = WORLD  # of its cameras
-    why: str = "none yet"  # why there is something to record; empty where there is nothing
+    mount: str = WORLD  # mount of its cameras
+    why: str = "none yet"  # why there is something to record; empty if there is nothing
     commands: int = 0  # steps sent to the robot
-    # Sum of the squares by which pixels of one pose are off their mean, px², and its degrees of freedom.
+    # Sum of the squares of deviations of pixels of one pose from their mean, px², and its degrees of freedom.
     scatter: FloatArray = field(default_factory=lambda: np.zeros(2))
 
     @property
@@ -196,9 +196,9 @@ def _random_pose(
         if truth is None:
             return q
         seen = np.isfinite(truth.within(truth.images(q, truth.M))[..., 0])
-        least = min(len(truth.P), 2)  # views that are to show a marker
-        inside = seen.sum(axis=0) >= least
-        facing = truth.faces(q).sum(axis=0) >= least
+        min_seen = min(len(truth.P), 2)  # views that are to show a marker
+        inside = seen.sum(axis=0) >= min_seen
+        facing = truth.faces(q).sum(axis=0) >= min_seen
         if inside.mean() >= _LEAST_SEEN and facing.mean() >= _LEAST_FACING:
             return q
     return reference
@@ -230,7 +230,7 @@ def new_recording(
 
     path : the table; None for one that is kept in memory.
     motions : further poses after the trial motions, numbered on.
-    force : start again, whatever ``path`` holds; else a table of another configuration is refused.
+    force : start again, replacing ``path``; otherwise a table of another configuration is refused.
     redo : start again also if ``path`` is a recording of the same plant with another configuration.
     """
     targets, joints, key = trial_motions(inputs.trials), inputs.trials.joints.joints(), inputs.key
@@ -256,7 +256,7 @@ def new_recording(
 
 
 def _resumed(empty: _Recording, maximum: FloatArray) -> _Recording:
-    """The poses of an interrupted recording taken over, at most so far (n,) from where they were to be."""
+    """The poses of an interrupted recording taken over, within (n,) of their intended joints."""
     recording = replace(empty, done={}, motion_readings={})
     path, remedy = recording.path, "choose another table, or replace it with --force (force=True)"
     recording.identity = identity_in(path)
@@ -299,7 +299,7 @@ def record_poses(
     """Record the pending poses, and keep those that are done however it ends.
 
     kept : whether the table is written.
-    robot : the robot to drive; None takes that of ``plant.use``, or simulates that of the configuration,
+    robot : the robot to drive; None takes that of ``plant.use``, or simulates the configured robot,
         which follows its set-points exactly unless it has faults.
     """
     if not recording.pending:
@@ -332,7 +332,7 @@ def record_poses(
 
 
 def _require_same_views(recording: _Recording, robot: PluginRobot) -> None:
-    """Take over the names of a robot's views; an InputError where a table has been begun with others."""
+    """Take over the names of a robot's views; an InputError if a table has been begun with others."""
     if recording.found and recording.view != robot.view:
         raise InputError(
             f"{recording.path}: was begun with the cameras {', '.join(recording.view)}, not "
@@ -343,7 +343,7 @@ def _require_same_views(recording: _Recording, robot: PluginRobot) -> None:
 
 
 def _show(recording: _Recording, robot: PluginRobot | None) -> None:
-    """Write a page next to the table where a robot has frames: how far it is, and the last pose with tags."""
+    """Write a page next to the table if a robot has frames: how far it is, and the last pose with tags."""
     if robot is None or robot.frames is None:
         return
     last, nothing, marker = recording.done[max(recording.done)], np.empty((0, 2)), recording.marker.tolist()
@@ -378,7 +378,7 @@ def observed(
     """Return the observations of the simulated robot, and the noise of its pixels, px, if known.
 
     q : (K, n) poses, rad or m, with a separate stream of noise; None for the trial motions.
-    seed : of that noise; None for that of the trials.
+    seed : of that noise; None for the seed of the trials.
     """
     truth, sigma_px = trials.truth, trials.noise_px
     assert truth is not None
@@ -435,7 +435,7 @@ class _Sight:
             waited, reading = waited + period, robot.read()
 
     def after(self, pose: int) -> None:
-        """Refuse to go on where the reference and the trial motions of a joint that ends show too little."""
+        """Refuse to go on if the reference and the trial motions of a joint that ends show too little."""
         count = self.inputs.trials.motions.frames_per_joint
         i, last = divmod(pose, count) if count else (0, 1)
         group = [0, *range((i - 1) * count + 1, pose + 1)]
@@ -459,7 +459,7 @@ class _Sight:
         return Setup(self.recording.mount, self.recording.view, self.recording.targets.shape[1])
 
     def _faceless(self) -> Finding | None:
-        """Tell which marker of the face no pose shows to two cameras so far; None where there is none.
+        """Tell which marker of the face no pose shows to two cameras yet; None if there is none.
 
         One camera shows it by itself.
         """
@@ -471,7 +471,7 @@ class _Sight:
         return Finding("faceless", REFUSES, Subject(markers=tuple(lost)), len(done), unit="1")
 
     def _wrong(self, s: FloatArray, where: Subject) -> Finding | None:
-        """Tell why looks (k, V, m, 2) are of no use; None where they are."""
+        """Tell why looks (k, V, m, 2) are of no use; None if they are."""
         seen, given, views = np.isfinite(s[..., 0]), self.inputs.dictionary, self.recording.view
         blind, total = ~seen.any(axis=(0, 2)), seen.shape[2]
         if blind.all():
@@ -489,8 +489,8 @@ class _Sight:
             return Finding("unseeing_camera", REFUSES, subject, count, limit=total, unit="1")
         often = -(-len(s) // 2)
         shared = int((shared_markers(s).sum(axis=0) >= often).sum())
-        least = (Finding("share", amount=MIN_SHARED, unit="1"),)
-        few = Finding("few_shared", REFUSES, where, shared, limit=total, unit="1", others=least)
+        min_seen = (Finding("share", amount=MIN_SHARED, unit="1"),)
+        few = Finding("few_shared", REFUSES, where, shared, limit=total, unit="1", others=min_seen)
         return few if shared < MIN_SHARED else None
 
     def _widths(self, s: FloatArray) -> list[float]:
@@ -525,7 +525,7 @@ def _recorded(
     steered, settle_s = Steered(robot), trials.rest.settle_s
     fit = None if sight is None else partial(sight.before, robot)
     if sight is not None:
-        for pose in recording.done:  # those of a call before
+        for pose in recording.done:  # poses of an earlier call
             sight.after(pose)
 
     def observe() -> Reading:
@@ -546,7 +546,7 @@ def _recorded(
 
 
 def _moving(seen: list[Reading], settle_s: float) -> list[Reading]:
-    """Return the readings in motion before all stood still, each frame once."""
+    """Return the readings in motion before all were at rest, each frame once."""
     found = []
     for before, reading in pairwise(seen):
         new = np.array(reading.new_views(before))

@@ -71,7 +71,7 @@ _GAINS = (0.5, 0.3, 0.1, 0.05, 0.02)
 _PERIODS_S = (0.16, 0.08, 0.04, 0.02, 0.01)
 STEP_LIMIT_DEG = 5.0
 _LAMBDAS = (1.0, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01)
-# Share of the translation that a step takes where its gain is as high as can be.
+# Share of the translation that a step takes if its gain is as high as can be.
 _FAST_PER_STEP = 0.9
 # Instants of a planned rotation, and steps of a law towards it.
 _INSTANTS, _STEPS = 4001, 400
@@ -95,7 +95,7 @@ class Comparison:
         return self.scenario.simulated.truth
 
     def run(self, law: str, operators: str, gains: Gains, *, limited: bool) -> Trace:
-        """Drive a direct law without limit, or with 5° a step and that of prismatic joints as configured."""
+        """Drive a direct law without limit, or with 5° per step and configured limits of prismatic joints."""
         seen = self.scenario_by(operators)
         limits = seen.termination
         speed = np.full(len(seen.ends.q_start), math.inf)
@@ -106,14 +106,14 @@ class Comparison:
         return trace_of(drive(scenario, self.plan.rotation_sense(), law, self.models[operators]))
 
     def followed(self) -> Trace | None:
-        """Drive directTHREE along the plan, with the configured limits; None where it cannot be followed."""
+        """Drive directTHREE along the plan, with the configured limits; None if it cannot be followed."""
         if not self.plan.feasible or self.plan.duration is None or np.isnan(self.plan.mu).any():
             return None
         law = run_name(DIRECT[0], TRACK)
         return trace_of(drive(self.scenario, self.plan, law, self.models["calibrated"]))
 
     def scenario_by(self, operators: str) -> RunScenario:
-        """Return the setting with the body, where the face is measured with one, in the frame of a model."""
+        """Return the setting with the body, if the face is measured with one, in the frame of a model."""
         exact = self.scenario.exact
         if operators == "calibrated" or not len(exact.body.M):
             return self.scenario
@@ -142,7 +142,7 @@ def comparison_of(inputs: ServoInputs, calibration: Calibration, plan: Plan) -> 
     """Set up the extra runs; images are without noise, but for a goal that is known by them alone.
 
     inputs : of laws by themselves on the ideal plant, which measure the face point by point, but with the
-        body where there are not two views: nothing keeps them out of regions. The goal is the taught pose.
+        body if there are not two views: nothing keeps them out of regions. The goal is the taught pose.
     """
     inputs = replace(inputs, plan=inputs.plan.of_taught_pose)
     if not is_stereo(calibration.view):
@@ -232,8 +232,8 @@ def composition_error(plan: Plan, lambdas: Sequence[float] = _LAMBDAS) -> FloatA
 def orientation_bias(plan: Plan, gains: Gains) -> FloatArray:
     """Farthest that each of ``DIRECT`` turns the face off its planned rotation, rad, [RH00] eq. (21).
 
-    Each step turns the face as the law wants to, exactly, and partitions what is left anew: no joint steps
-    are involved. The planned rotation of directTHREE is exp(μ θ_r Ĥ_r) exp(μ θ_p Ĥ_p) of eq. (17), that of
+    Each step turns the face as the law wants to, exactly, and partitions the rest again: no joint steps
+    are involved. The planned rotation of directTHREE is exp(μ θ_r Ĥ_r) exp(μ θ_p Ĥ_p) of eq. (17), and of
     directTWO exp(μ θ_s Ĥ_s), for μ from 0 to 1. From a metric plan.
     """
     r, p = screws(plan.H_hat)[1:, :3]
@@ -250,7 +250,8 @@ def orientation_bias(plan: Plan, gains: Gains) -> FloatArray:
             sine = float(np.linalg.norm(c))
             onto = math.atan2(sine, float(R.apply(p) @ goal.apply(p))) * c / sine if sine > 0.0 else c
             within = float((Rotation.from_rotvec(-onto) * left).as_rotvec() @ normal)
-            theta_p = within - 2.0 * math.pi * round((within - theta_p) / (2.0 * math.pi))  # in its sense
+            # in the sense of the planned one
+            theta_p = within - 2.0 * math.pi * round((within - theta_p) / (2.0 * math.pi))
             three = gains.gain_r * onto + gains.gain_p * theta_p * normal
             two = gains.gain_s * left.as_rotvec()
             R = Rotation.from_rotvec(gains.period * (three, two)[law]) * R
@@ -263,12 +264,14 @@ def orientation_bias(plan: Plan, gains: Gains) -> FloatArray:
 
 
 def composition_of(plan: Plan, gains: Gains) -> Composition:
-    """How the parts of a metric plan go together; raises WorkFailed if the task has no rotation."""
+    """Composition of the parts of a metric plan; raises WorkFailed if the task has no rotation."""
     distance = composition_error(plan)
     r, p = screws(plan.H_hat)[1:, :3]
     axis = (Rotation.from_rotvec(plan.theta_r * r) * Rotation.from_rotvec(plan.theta_p * p)).as_rotvec()
-    way = screws(plan.H_hat)[0, 3:]
-    cosine = abs(float(way @ axis)) / max(float(np.linalg.norm(way) * np.linalg.norm(axis)), 1e-300)
+    translation = screws(plan.H_hat)[0, 3:]
+    cosine = abs(float(translation @ axis)) / max(
+        float(np.linalg.norm(translation) * np.linalg.norm(axis)), 1e-300
+    )
     return Composition(
         np.array(_LAMBDAS), distance, math.acos(min(1.0, cosine)), orientation_bias(plan, gains)
     )
@@ -277,7 +280,7 @@ def composition_of(plan: Plan, gains: Gains) -> Composition:
 def run(inputs: ReportInputs, run: Run, directory: Path, *, progress: Progress = silent) -> Report:
     """Make the extra runs, draw the figures, measure the claims and write the page.
 
-    run : with calibration, plan and traces; where there is no task, with the calibration. Of a robot without
+    run : with calibration, plan and traces; if there is no task, with the calibration. Of a robot without
         a model the page has plan and runs, and the figures that need no model.
     directory : folder of the run; receives ``figures/``, ``claims.json`` and ``report.html``.
     """
@@ -325,7 +328,7 @@ def _run(
     content = {"claims": report.claims, "drift": drift_rows(report), "omitted": report.omitted}
     text = json.dumps(content, ensure_ascii=False, allow_nan=False, indent=2)
     write_whole(directory / CLAIMS_FILE, f"{text}\n")
-    for name in (VIEW_FILE, ANIMATION_FILE):  # of other runs than those that are reported on now
+    for name in (VIEW_FILE, ANIMATION_FILE):  # files of runs that are not in this report
         (directory / name).unlink(missing_ok=True)
     result = Result("", run.configuration, provenance.collect(seed=inputs.about.seed), {}, {"": report})
     write_page(replace(run, results={**run.results, "report": result}), inputs.about)
@@ -334,7 +337,7 @@ def _run(
 
 @contextmanager
 def _unless_it_fails(what: str, left_out: list[dict[str, str]]) -> Iterator[None]:
-    """Do something that a report can be without; where it fails, say why."""
+    """Do something that a report can be without; if it fails, say why."""
     try:
         yield
     except WorkFailed as error:
@@ -405,7 +408,7 @@ def _draw_all(
 
 
 def _replace_figure(folder: Path, name: str, contents: Mapping[str, bytes]) -> None:
-    """Write the files of a figure by their kinds, and remove those of other kinds."""
+    """Write the files of a figure by their kinds, and remove files of other kinds."""
     for kind in {*style.FORMATS, _NUMBERS} - {*contents}:
         (folder / f"{name}.{kind}").unlink(missing_ok=True)
     for kind, content in contents.items():

@@ -54,7 +54,8 @@ class Scenario:
     true_ends: Ends  # true poses of the tool; NaN if unknown
     q_taught: FloatArray | None  # (n,) joints at which the goal was taught, rad or m; None if unknown
     goal_joints: FloatArray  # (k, n) joints at which the goal is shown, rad or m; k is 0 if unknown
-    # (V, b, 2) images of the goal that was chosen among those of the incidences, px; None for the taught one
+    # (V, b, 2) images of the goal that was chosen among the goals of the incidences, px; None for the taught
+    # one
     s_chosen: FloatArray | None = None
     objects: tuple[Place, ...] = ()  # the taught goal where its objects have it now
 
@@ -80,7 +81,7 @@ class Scenario:
         return self.goal_joints[:0] if displaced else self.goal_joints
 
     def towards(self, plan: Plan) -> Self:
-        """Return the scenario with the goal that a plan carried along, or chose among those of incidences."""
+        """Return the scenario with the goal that a plan carried along, or chose among goals of incidences."""
         found = self.carried(plan.carried)
         if plan.open_goal is None and not plan.carried:
             return found
@@ -93,13 +94,13 @@ class Scenario:
         if not objects:
             return self
         exact, none = self.exact, np.zeros((0, 4))
-        places = tuple(
+        moved_objects = tuple(
             Place(one.s_carried, none if one.M_object is None else one.M_object) for one in objects
         )
         if len(exact.q_near):
-            shown = exact._replace(goal=exact.goal.carried_to(places))
-            exact = exact._replace(q_near=_joints_near_goal(self.world, shown, None))
-        return replace(self, objects=places, exact=exact, goal_joints=self.goal_joints[:0])
+            at_objects = exact._replace(goal=exact.goal.carried_to(moved_objects))
+            exact = exact._replace(q_near=_joints_near_goal(self.world, at_objects, None))
+        return replace(self, objects=moved_objects, exact=exact, goal_joints=self.goal_joints[:0])
 
     def images_for(self, law: str) -> TaskImages:
         """Start and goal as a law measures them: with the body, or point by point."""
@@ -136,7 +137,7 @@ class Scenario:
             tags=self._tags(),
             units=units,
             view=self.world.view,
-            least_views=self.world.least_views,
+            min_views=self.world.min_views,
         )
 
     def _tags(self) -> IntArray:
@@ -227,7 +228,7 @@ class RunScenario(Scenario):
 def world_of(inputs: PlanInputs, calibration: Calibration) -> CalibratedWorld:
     """Return the world of inputs, as a calibration has it.
 
-    Raises InputError where the calibration is of other views or markers, and for points without two views;
+    Raises InputError if the calibration is of other views or markers, and for points without two views;
     WorkFailed for an arm of one joint.
     """
     truth, face = inputs.truth, inputs.face
@@ -274,7 +275,7 @@ def scenario_of(inputs: PlanInputs, calibration: Calibration) -> Scenario:
     exact = exact.asking(_positions(inputs.incidences, world.numbers, inputs.carriers))
     if not is_stereo(world.view):
         exact = exact._replace(q_near=_joints_near_goal(world, exact, q_goal))
-    exact = exact._replace(least_views=world.least_views)
+    exact = exact._replace(min_views=world.min_views)
     joints = np.empty((0, len(world.joints.types))) if q_goal is None else q_goal[None]
     return Scenario(world, exact, world.true_ends(exact, q_goal), q_goal, joints)
 
@@ -284,7 +285,7 @@ def _positions(
 ) -> tuple[Incidence, ...]:
     """Incidences by positions in the body instead of numbers of markers; raises as ``in_body``.
 
-    Markers of the object of a feature come after those of the body.
+    Markers of the object of a feature come after the markers of the body.
     """
     found = list[Incidence]()
     for one in asked:
@@ -327,7 +328,7 @@ def run_scenario(inputs: ServoInputs, calibration: Calibration) -> RunScenario:
         substeps=laws.substeps == "auto",
         scale=conditions.speed_scale,
     )
-    # What was just made holds its fields alone: nothing is derived from them yet.
+    # A new record holds its fields alone: derived values are missing.
     return RunScenario(**vars(found), servo=inputs, gains=gains, termination=termination)
 
 

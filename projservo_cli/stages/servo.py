@@ -29,7 +29,7 @@ _SAME_START, _SAME_GOAL_PX = 1e-6, 10.0
 def run(inputs: ServoInputs, calibration: Calibration, plan: Plan, name: str, **brought: Any) -> Trace:
     """Drive one law in one mode from the start of the task to its verdict.
 
-    name : of the run: that of the law, with the mode where it follows the plan, such as ``exact_track``.
+    name : of the run: the law's, with the mode if it follows the plan, such as ``exact_track``.
     brought : by a caller: ``factory``, ``robot``, ``blind`` and ``session`` of ``LawRun``.
     Raises InputError if a part of the simulation is missing, the plan is of another task, or the plan to
     follow has no time; WorkFailed if the goal cannot be reached, or the joints cannot follow the plan and
@@ -37,7 +37,7 @@ def run(inputs: ServoInputs, calibration: Calibration, plan: Plan, name: str, **
     """
     task = inputs.plan.task
     if task is not None and task.start_joints is None and inputs.plan.q_current is None:
-        # where the arm stood when it was planned
+        # joints of the arm when it was planned
         inputs = replace(inputs, plan=replace(inputs.plan, q_current=plan.q_start))
     scenario = run_scenario(inputs, calibration)
     _require_its_task(scenario.towards(plan), plan)
@@ -52,7 +52,7 @@ def _require_its_task(scenario: RunScenario, plan: Plan) -> None:
     elif (away := float(np.abs(ends.q_start - plan.q_start).max())) > _SAME_START:
         what = f"it starts {away:.3g} rad or m from task.start"
     elif (off := float(np.nanmax(np.abs(ends.s_star - plan.s_star), initial=0.0))) > _SAME_GOAL_PX:
-        what = f"its goal images are {off:.3g} px from those of task.goal"
+        what = f"its goal images are {off:.3g} px from task.goal"
     else:
         return
     raise InputError(f"the plan is of another task than the configuration: {what}; plan this task first")
@@ -90,7 +90,7 @@ def drive(
 
 
 def _in_compiled_loop(inputs: ServoInputs, law: str) -> bool:
-    """Whether the compiled loop runs a law; the others are run in Python and are given the whole plan."""
+    """Whether the compiled loop runs a law; the others run in Python with the whole plan."""
     return law in CODES and inputs.conditions.speed_scale == 1.0 and inputs.contract is None
 
 
@@ -98,6 +98,6 @@ def sense_is_enough(inputs: ServoInputs, name: str) -> bool:
     """Whether a run needs no more of the plan than the sense of its rotations."""
     law, mode = law_and_mode(name)
     asked = inputs.plan
-    # Any other goal than a pose needs that of the plan.
+    # Any other goal than a pose needs the goal of the plan.
     pose = law != INCIDENCES and not asked.incidences and not asked.carriers
     return mode == REGULATE and _in_compiled_loop(inputs, law) and pose

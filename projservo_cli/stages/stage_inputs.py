@@ -35,17 +35,17 @@ from projservo_cli.task.stand_off import StandOff
 class JointSettings(NamedTuple):
     """Joints as far as they are configured; data give the rest."""
 
-    types: str  # one letter a joint, R or P; empty where only a table gives them
+    types: str  # one letter a joint, R or P; empty if only a table gives them
     ranges: tuple[tuple[float, float], ...] | None  # lowest and highest readings of an arm, rad or m
-    limits: LimitSettings | None  # of a robot without kinematics
-    unit: str  # in which somebody gave readings of revolute joints, deg or rad
-    known: int  # of how many joints readings were given; 0 where nobody did
+    limits: LimitSettings | None  # limits of a robot without kinematics
+    unit: str  # unit of the given readings of revolute joints, deg or rad
+    known: int  # number of joints with given readings
     speeds: SpeedLimits = SpeedLimits()
 
     def joints(self, default_types: str = "", calibration: Calibration | None = None) -> Joints:
-        """Joints of the robot; of ``default_types``, else revolute ones, where their types are unknown.
+        """Joints of the robot; of ``default_types``, otherwise revolute ones, if their types are unknown.
 
-        calibration : whose data give limits where they are taken from there; without, none are.
+        calibration : whose data give limits if they are taken from there; without, none are.
         """
         types, pace = self.types or default_types or "R" * self.known, self.speeds
         lower, upper = self._limits(types, calibration)
@@ -73,7 +73,7 @@ class JointSettings(NamedTuple):
 class Following(NamedTuple):
     """Pace of commands to a robot of the contract, and limits of its servos."""
 
-    period: float  # of commands, s
+    period: float  # period of commands, s
     speed_scale: float  # factor of every command
     servos: ServoLimits
 
@@ -89,15 +89,15 @@ class Following(NamedTuple):
 
 
 class OwnRobot(NamedTuple):
-    """A robot of somebody's."""
+    """The user's robot."""
 
     target: str  # its class, module:Class
     options: dict[str, Any]  # arguments that the class is made with
-    dictionary: str | None  # of tags, which a class that takes it is given
+    dictionary: str | None  # dictionary of tags, passed to a class that takes it
     timeout_s: float  # most time an answer may take
     open_s: float  # most time that opening may take
     image_size: ImageSize | None  # width and height of its images, px, if known
-    cameras: Cameras | None = None  # of an arm that reads joints alone
+    cameras: Cameras | None = None  # cameras of an arm that reads joints alone
     board: Board | None = None  # whose corners these show; None for tags
 
 
@@ -116,8 +116,8 @@ class Motions(NamedTuple):
     reference: JointVector
     amplitude: tuple[float, float]  # farthest trial to each side, revolute joints, rad, and prismatic ones, m
     frames_per_joint: int
-    random_poses: int  # of all joints at once
-    # rad by which trials are spread at most, so that no reading repeats its error; 0 where none has any
+    random_poses: int  # number of poses of all joints at once
+    # rad by which trials are spread at most, so that no reading repeats its error; 0 if none has any
     spread: float
     seed: int
 
@@ -128,8 +128,8 @@ class Trials:
 
     motions: Motions
     joints: JointSettings
-    truth: Truth | None  # robot, rig and markers as they are; None for a robot of somebody's
-    driven: Drive | None  # by the contract; None for one that stands wherever it is sent
+    truth: Truth | None  # robot, rig and markers as they are; None for a user's robot
+    driven: Drive | None  # drive by the contract; None for one that reaches every set-point
     noise_px: float  # standard deviation of simulated pixels
     rest: Rest  # at each pose, of a robot that is driven
 
@@ -139,11 +139,11 @@ class RecordingInputs:
     """Inputs of a recording."""
 
     trials: Trials
-    numbers: tuple[int, ...]  # of the markers
+    numbers: tuple[int, ...]  # numbers of the markers
     face: tuple[int, ...]  # numbers of the markers that must stay visible; may be empty
-    dictionary: str | None  # of the tags; None if not configured
+    dictionary: str | None  # dictionary of the tags; None if not configured
     tagged: bool  # whether markers are corners of tags
-    mount: str  # of the cameras, world or tool
+    mount: str  # mount of the cameras, world or tool
     max_steady_state_error_deg: float  # how far a joint at rest may stay from its set-point
 
     @property
@@ -162,7 +162,7 @@ class RecordingInputs:
 
     @property
     def own(self) -> OwnRobot | None:
-        """The robot of somebody's that is driven."""
+        """The user's robot that is driven."""
         robot = self.trials.driven.robot if self.trials.driven is not None else None
         return robot if isinstance(robot, OwnRobot) else None
 
@@ -171,14 +171,15 @@ class Table(NamedTuple):
     """A recorded table and its settings."""
 
     file: File
-    readings: File | None  # table of joints beside a list of detections
+    readings: File | None  # table of joints for a list of detections
     joint_types: str | None  # one letter a joint, R or P; None for R
-    joint_unit: str | None  # of revolute joints, deg or rad; None for rad unless readings look like degrees
+    # unit of revolute joints, deg or rad; None for rad unless readings look like degrees
+    joint_unit: str | None
     image_size: ImageSize | None  # width and height, px, of both images or of one each, if known
     noise_px: float | None  # standard deviation of a coordinate; None to estimate it
-    seed: int  # of random starts
-    mount: str | None  # of the cameras, world or tool; None for what the table states
-    order_stated: bool  # whether somebody stated the order of the joints
+    seed: int  # seed of random starts
+    mount: str | None  # mount of the cameras, world or tool; None as the table states
+    order_stated: bool  # whether the user stated the order of the joints
 
 
 @dataclass(frozen=True)
@@ -198,7 +199,7 @@ class CalibrationInputs:
 
     source: Table | Trials
     estimation: Estimation
-    joint_noise: float | None  # standard deviation of joint readings, rad; None for that of the source
+    joint_noise: float | None  # standard deviation of joint readings, rad; None for the noise of the source
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,8 +209,8 @@ class RefitInputs:
     before: "CalibrationInputs | RefitInputs"
     view: str  # name of the camera
     file: File  # table of images by it
-    readings: File | None  # table of joints beside a list of detections
-    joint_unit: str | None  # of revolute joints, deg or rad; None for rad
+    readings: File | None  # table of joints for a list of detections
+    joint_unit: str | None  # unit of revolute joints, deg or rad; None for rad
     image_size: ImageSize | None  # width and height, px, of all images or of one each, if known
     max_predicted_px: float | None = None  # error of predictions that is accepted, px
 
@@ -220,7 +221,7 @@ class SuggestionInputs(NamedTuple):
     joints: JointSettings
     image_size: ImageSize | None  # width and height, px, of both images or of one each, if known
     recorded: bool  # whether the robot may not go farther than it was
-    unit: str  # of revolute joints in the list
+    unit: str  # unit of revolute joints in the list
     seed: int
 
 
@@ -230,9 +231,9 @@ class TeachInputs:
 
     driven: Drive
     joints: JointSettings
-    numbers: tuple[int, ...]  # of the markers
+    numbers: tuple[int, ...]  # numbers of the markers
     noise_px: float  # standard deviation of simulated pixels
-    settle_s: float  # for how long joints and images have stood still before
+    settle_s: float  # time for which joints and images have been at rest before
     seed: int
     objects: Objects
 
@@ -243,11 +244,11 @@ class PreflightInputs:
 
     driven: Drive
     joints: JointSettings
-    numbers: tuple[int, ...]  # of the markers
+    numbers: tuple[int, ...]  # numbers of the markers
     markers: Markers
-    dictionary: str | None  # of the tags; None if not configured
-    mount: str  # of the cameras, world or tool
-    noise_px: float  # of the images of a run, with the factor of its test
+    dictionary: str | None  # dictionary of the tags; None if not configured
+    mount: str  # mount of the cameras, world or tool
+    noise_px: float  # noise of the images of a run, with the factor of its test
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,32 +256,32 @@ class PlanInputs:
     """Inputs of a plan, except the calibration."""
 
     task: TaskSettings | None
-    seed: int  # of the noise of start and goal
+    seed: int  # seed of the noise of start and goal
     truth: Truth | None  # robot, rig and markers as they are; None for a robot that is not simulated
     arm: SerialArm | None  # kinematics as they are described, if they are
-    # (V, 3, 4) cameras as they are described, px, if they are: from the frame of what they are mounted on
+    # (V, 3, 4) described cameras, px, if any: from the frame of their mount
     P: FloatArray | None
-    mount: str  # of the cameras, world or tool
+    mount: str  # mount of the cameras, world or tool
     scene: RenderedScene | None  # where cameras are rendered
     face: tuple[int, ...]  # numbers of the markers that must stay visible
     center: int  # position of the centre marker within the face, or ``MIDPOINT``
-    known: tuple[int, ...] | None  # numbers of all markers; None for those of the calibration
+    known: tuple[int, ...] | None  # numbers of all markers; None for the markers of the calibration
     tags: tuple[tuple[int, ...], ...]  # numbers of the corners of each tag among them
     joints: JointSettings
     image_size: ImageSize | None  # width and height, px, of both images or of one each, if known
-    noise: LoopNoise  # of simulated pixels
-    features: str | None  # points, body, or None for body where the calibration is usable
+    noise: LoopNoise  # noise of simulated pixels
+    features: str | None  # points, body, or None for body if the calibration is usable
     tests_images: bool  # whether images are tested against the calibration
     trajectory: Trajectory
     lengths: FloatArray  # (m, m) distances between the markers of the face, m; NaN if unknown
     # that are to hold at the goal, by numbers of markers; none for the pose
     incidences: tuple[Incidence, ...] = ()
-    # Width and height to which recorded images reach at least, px, where their size is not known.
+    # Width and height to which recorded images reach at least, px, if their size is not known.
     seen_px: ImageSize | None = None
-    # Objects that the goal was taught on; none for a goal that stands still.
+    # Objects that the goal was taught on; none for a fixed goal.
     carriers: "tuple[CarryingObject, ...]" = ()
-    displaced: StandOff | None = None  # of the goal, or of the start in its place
-    q_current: FloatArray | None = None  # (n,) joints where the arm stands, rad or m, once that is known
+    displaced: StandOff | None = None  # displacement of the goal, or of the start instead
+    q_current: FloatArray | None = None  # (n,) present joints of the arm, rad or m, once that is known
 
     @property
     def required_task(self) -> TaskSettings:
@@ -305,11 +306,11 @@ class Contract(NamedTuple):
     """Further inputs of a run by the contract."""
 
     driven: Drive
-    events: Events  # of a simulated robot
+    events: Events  # events of a simulated robot
     timeout_s: float  # most time that an answer may take
-    time_offset_s: EachView | None  # of the images of the cameras; None to estimate them
-    settle_s: float | None  # for how long a robot of somebody's has stood still at the start
-    identity: str = ""  # of the robot in the recording that the calibration is of; may be empty
+    time_offset_s: EachView | None  # time offset of the images of the cameras; None to estimate them
+    settle_s: float | None  # time for which a user's robot has been at rest at the start
+    identity: str = ""  # identity of the robot in the calibration's recording; may be empty
 
 
 @dataclass(frozen=True, eq=False)
@@ -324,9 +325,9 @@ class ServoInputs:
 
 
 class KnownLengths(NamedTuple):
-    """Lengths on the tool that somebody measured."""
+    """Measured lengths on the tool."""
 
-    numbers: tuple[int, ...]  # of the markers
+    numbers: tuple[int, ...]  # numbers of the markers
     apart: FloatArray  # (m, m) distances between them, m; NaN if unknown
     tag_size_m: float | None  # side of tags whose places are not known; None without such
     face: tuple[int, ...]  # numbers of the markers whose frame the tool has; may be empty
@@ -338,11 +339,11 @@ class CarryingObject:
 
     name: str
     objects: Objects  # all of them, how far they may have moved, and how uncertain the goal may be
-    taught: GoalImages | None  # its images when the goal was taught; None for those of a simulation
+    taught: GoalImages | None  # its images when the goal was taught; None for images of a simulation
     placed: SceneObject | None  # where it is in a simulation
     at_first: RenderedScene | None  # scene with it where it was when the goal was taught
     driven: Drive | None  # robot that looks at it; None where images are simulated by themselves
-    rest: Rest  # of such a robot
+    rest: Rest  # rest of such a robot
     lengths: KnownLengths
 
     @property
@@ -357,7 +358,7 @@ class ReportInputs:
 
     about: About
     files: ReportSettings
-    extra: ServoInputs | None  # of laws by themselves on the ideal plant; None where there is no task
+    extra: ServoInputs | None  # inputs of laws by themselves on the ideal plant; None if there is no task
     trajectory: Trajectory  # requested motion of the plan
     lengths: KnownLengths
 
@@ -365,7 +366,7 @@ class ReportInputs:
 class Scenery(NamedTuple):
     """Scene of the runs."""
 
-    name: str  # of the configuration
+    name: str  # name of the configuration
     truth: Truth  # robot, rig and face as they are described
     opaque: bool  # whether the face hides its markers from a camera behind it
-    simulated: bool  # whether joints are those of a simulation, else those that a robot reported
+    simulated: bool  # whether joints are simulated; otherwise a robot reported them

@@ -1,4 +1,4 @@
-"""Teach: what the cameras see where somebody has moved the robot to, as a goal or as a start."""
+"""Teach: images of a robot that the user has moved, as a goal or as a start."""
 
 import math
 import time
@@ -39,8 +39,8 @@ from projservo_cli.stages.worlds.external_robot import plugin_robot, simulated_r
 from projservo_cli.store.display import require_radians
 from projservo_cli.task.displaced_object import RIGID
 
-_FAR = 4.0  # standard deviations that a marker may be off
-_DIGITS = 4  # of pixels that are written
+_FAR = 4.0  # standard deviations by which a marker may err
+_DIGITS = 4  # digits of written pixels
 _SLACK = 1e-3  # rad or m; by how much more than it sags a reading may change
 # From how far, rad or m, a simulated robot comes to where it is put, and how long it then rests, s.
 _BESIDE, _AT_REST_S = 0.02, 3
@@ -57,7 +57,7 @@ class _Taught:
     sigma: FloatArray  # (V, m) standard deviation of a coordinate of that mean, px; NaN if unknown
     frames: IntArray  # (V,) how many there were of each view
     moved: FloatArray | None  # (n,) by how much joints moved when they were held again; None if never
-    bounds: Bounds  # of the robot, with the units of its joints
+    bounds: Bounds  # bounds of the robot, with the units of its joints
     seen: tuple[Observation, BoolArray]  # frames that they are the mean of, and which are new (K, V)
 
     objects: dict[str, "_Taught"] = field(default_factory=dict)  # objects that it saw, by their names
@@ -105,8 +105,8 @@ class _Taught:
 class _Checked(NamedTuple):
     """Comparison of a taught pose with a calibration."""
 
-    off_px: FloatArray  # (V, m) error of markers against the joints that reach it, else those read
-    far: list[tuple[int, str, float]]  # markers beyond what noise explains, which view, how far, px
+    off_px: FloatArray  # (V, m) error of markers against the joints that reach it, otherwise the joints read
+    far: list[tuple[int, str, float]]  # markers that noise does not explain, view, distance, px
     reached: bool
     reason: str  # whether joints reach it, in words
     findings: tuple[Finding, ...]  # likewise
@@ -118,7 +118,7 @@ def teach(
     at: JointVector | None = None,
     wait: Callable[[str], None] | None = None,
 ) -> _Taught:
-    """Look where the robot stands, and average so many frames of each camera.
+    """Observe the robot in its present pose, and average frames of each camera.
 
     at : joints that a simulated robot is put to.
     wait : asks the user to act, and returns afterwards; None without a user, so that
@@ -175,7 +175,7 @@ def _robot_to_teach(
 ) -> tuple[PluginRobot, FloatArray | None]:
     """Return the robot, and the joints (n,), rad or m, that a simulated one was put to.
 
-    by_hand : whether somebody moves it, so that it must hold again where it was released.
+    by_hand : whether a user moves it, so that it must hold again after its release.
     """
     joints, driven = inputs.joints.joints(), inputs.driven
     if not isinstance(driven.robot, OwnRobot):
@@ -202,7 +202,7 @@ def _require_limits(joints: Joints) -> None:
 
 
 def _within_limits(at: JointVector, joints: Joints) -> FloatArray:
-    """The joints (n,) of ``--at``, rad or m. Raises InputError where the robot cannot be put there."""
+    """The joints (n,) of ``--at``, rad or m. Raises InputError if the robot cannot be put there."""
     if len(at.joints) != len(joints.types):
         raise InputError(f"--at: {len(at.joints)} numbers for {len(joints.types)} joints: give one for each")
     q = at.values(joints.types)
@@ -252,9 +252,9 @@ def checked(inputs: PlanInputs, calibration: Calibration, taught: _Taught) -> _C
     start = JointVector(joints=within.tolist(), unit="rad")
     limits = np.concatenate([joints.limits.lower, joints.limits.upper, joints.limits.speed])
     markers = calibration.marker.tolist()
-    # No path is searched for joints whose limits are not known: the arm stands at the goal as it is.
+    # No path is searched for joints of unknown limits: the arm is at the goal already.
     profile = "joint_space" if np.isfinite(limits).all() else "linear"
-    border = inputs.trajectory.border_px + 1.0  # beyond what the goal shows, where the size is not known
+    border = inputs.trajectory.border_px + 1.0  # beyond the pixels of the goal, if the size is not known
     seen_px = np.ceil(np.nanmax(s, axis=1) + border).astype(int).tolist()
     asked = replace(
         inputs,
@@ -303,7 +303,7 @@ def require_start(taught: _Taught) -> None:
 
 
 def require_objects(taught: _Taught, *, one_goal: bool) -> Finding | None:
-    """Return which object shows too little to carry a goal along, or that all are out of sight; else None.
+    """Return the object that shows too little to carry a goal along, or that all are out of sight, or None.
 
     one_goal : whether there is no other goal, so that this one is on an object; a WorkFailed says it then.
     """
@@ -325,12 +325,12 @@ def _seen_of(one: _Taught) -> list[int]:
     return found
 
 
-def require_face(face: Sequence[int], taught: _Taught, least: int | None = None) -> None:
-    """Refuse what does not show the whole face to enough cameras, with a WorkFailed.
+def require_face(face: Sequence[int], taught: _Taught, min_seen: int | None = None) -> None:
+    """Raise WorkFailed unless enough cameras see the whole face.
 
-    least : number of cameras; None for all.
+    min_seen : number of cameras; None for all.
     """
-    enough = np.isfinite(taught.s[..., 0]).sum(axis=0) >= (least or len(taught.view))
+    enough = np.isfinite(taught.s[..., 0]).sum(axis=0) >= (min_seen or len(taught.view))
     shared = {*taught.marker[enough].tolist()}
     if unseen := [(number, side) for number, side in taught.unseen if number in {*face} - shared]:
         number, side = unseen[0]

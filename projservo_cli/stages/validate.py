@@ -1,4 +1,4 @@
-"""Validate: further images against a calibration, by their residuals, and what they show to have changed."""
+"""Validate: further images against a calibration, by their residuals, and the changes that they show."""
 
 from dataclasses import replace
 from typing import Any
@@ -13,17 +13,17 @@ from projservo_cli.messages import lines, setup_of
 from projservo_cli.monitoring.fault_at_rest import fault_at_rest
 from projservo_cli.records import Calibration, Observation
 
-# Frames, at most, by which what changed is told.
+# Maximum number of frames to identify a change.
 _MOST_TOLD = 300
 
 
 def compared(
     calibration: Calibration, observation: Observation, image_size: ImageSize | None = None
 ) -> dict[str, Any]:
-    """Return statistics of residuals as ``residual_statistics``, with what changed since the calibration.
+    """Return statistics of residuals as ``residual_statistics``, with the changes since the calibration.
 
-    Frames of one posture show that as they do to ``doctor``, and no view has a limit of its own. Of several
-    postures the medians decide, as some images of a recording may be off: what changed is told beside them.
+    Frames of one posture show that as they do to ``doctor``, and no view has a separate limit. Of several
+    postures the medians decide, as some images of a recording may err: changes are reported with them.
 
     Raises InputError as ``residual_statistics``.
     """

@@ -87,7 +87,7 @@ def plain(value: Any, *, finite: bool = False) -> Any:
     """
     if isinstance(value, Finding):
         value = value.plain()
-    if hasattr(value, "tolist"):  # of NumPy
+    if hasattr(value, "tolist"):  # a NumPy value
         value = value.tolist()
     if isinstance(value, (list, tuple)):
         return [plain(inner, finite=finite) for inner in value]
@@ -132,7 +132,7 @@ def require_radians(
 
 
 def numbers_in(name: str, given: npt.ArrayLike, said: str) -> FloatArray:
-    """Convert to an array of real numbers, NaN where masked; an InputError for anything else.
+    """Convert to an array of real numbers, NaN where masked; an InputError for other values.
 
     said : the shape, for messages.
     """
@@ -148,7 +148,7 @@ def numbers_in(name: str, given: npt.ArrayLike, said: str) -> FloatArray:
 def checked_array(
     name: str, given: npt.ArrayLike, shape: Sequence[int | None], said: str, *, finite: bool = False
 ) -> FloatArray:
-    """Convert to an array of numbers and check its shape; None stands for any length of one or more.
+    """Convert to an array of numbers and check its shape; None means any length of one or more.
 
     said : the shape, for messages.
     Raises InputError, naming the array and the shapes.
@@ -171,7 +171,7 @@ class About(NamedTuple):
     name: str
     seed: int
     recorded: bool  # whether the calibration comes from a table
-    estimates_noise: bool  # whether that of its pixels is estimated
+    estimates_noise: bool  # whether its pixel noise is estimated
     joints: tuple[str | None, ...]  # names of the joints
     required: tuple[str, ...] | None  # laws that must converge; None for all but classical ones
     text: tuple[str | File, ...]  # all of it as YAML, of which files are parts

@@ -25,8 +25,8 @@ _BASE, _TOOL, FLANGE = "base_link", "tool", "flange"
 def opencv_yaml(found: OpenCV, size: ImageSize | None, names: Sequence[str], mount: str) -> str:
     """Cameras by their names, and of two the stereo rig, for ``cv2.FileStorage``, in words of its samples.
 
-    R and T of a camera map the base frame to it; those of the rig map the first camera to the second. Cameras
-    on the tool have what ``cv2.calibrateHandEye`` returns instead, their poses in the flange.
+    R and T of a camera map the base frame to it; R and T of the rig map the first camera to the second.
+    Cameras on the tool have their poses in the flange instead, as ``cv2.calibrateHandEye`` returns.
     """
     K, poses = found.body.intrinsics(), found.body.camera_poses()
     lines = ["%YAML:1.0", "---", f"delta_chi2: {found.delta_chi2!r}"]
@@ -36,7 +36,7 @@ def opencv_yaml(found: OpenCV, size: ImageSize | None, names: Sequence[str], mou
         each = {"": sizes[0]} if alike else {f"{n}_": one for n, one in zip(names, sizes, strict=True)}
         for name, (width, height) in each.items():
             lines += [f"{name}image_width: {width}", f"{name}image_height: {height}"]
-    K[:, 0, 1] = 0.0  # what rounding leaves
+    K[:, 0, 1] = 0.0  # rounding errors
     world = rigid_inverse(poses)
     for v, view in enumerate(names):
         lines += _matrix(f"{view}_camera_matrix", K[v])

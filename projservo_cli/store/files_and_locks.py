@@ -73,7 +73,7 @@ def text_of(path: Path | str, expected: str, max_bytes: int) -> str:
 
 
 def lines_of(path: Path | str, expected: str, max_bytes: int) -> Iterator[str]:
-    """Yield the lines, with their ends, of a file like that of ``text_of``.
+    """Yield the lines, with their ends, of a file as ``text_of`` returns it.
 
     Raises InputError, with the line, at a NUL byte, a line without end, or if the file is no text.
     """

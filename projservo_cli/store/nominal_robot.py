@@ -14,7 +14,7 @@ from projservo_cli.records import FloatArray, InputError
 from projservo_cli.settings.sections import Matrix34, Matrix44, Vector3, not_a_screw, not_rigid
 from projservo_cli.store.files_and_locks import text_of
 
-_MAX_BYTES = 10_000_000  # of the file
+_MAX_BYTES = 10_000_000  # maximum size of the file
 
 
 class _Screw(BaseModel):
@@ -77,10 +77,10 @@ def read_nominal(path: Path | str) -> dict[str, Any]:
 
 
 def _once(path: Path | str, pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Keys and values of an object. Raises InputError for a key that stands there twice."""
+    """Keys and values of an object. Raises InputError for a key that occurs twice."""
     names = [name for name, _ in pairs]
     if twice := [name for name in names if names.count(name) > 1]:
-        raise InputError(f"{path}: the key {twice[0]} stands in one object twice; keep one")
+        raise InputError(f"{path}: the key {twice[0]} occurs twice in one object; keep one")
     return dict(pairs)
 
 
@@ -106,7 +106,7 @@ def _believed(path: Path | str) -> _Believed:
 
 
 def _twist(where: str, screw: _Screw) -> FloatArray:
-    """Twist (4, 4) of a screw that a configured robot may have, freed of what rounding left of a pitch."""
+    """Twist (4, 4) of a screw that a configured robot may have, without the pitch that rounding left."""
     w, v = np.array(screw.w), np.array(screw.v)
     for key, what in not_a_screw("R" if w.any() else "P", screw.w, screw.v):
         raise InputError(f"{where}: {key} {what}")

@@ -55,11 +55,11 @@ _MAX_JOINTS = 64  # maximum number of joints, as in a configuration
 _MAX_COLUMNS = 10_000  # maximum number of columns
 _MAX_BYTES = 1_000_000_000  # maximum size of a table, far beyond the size of a calibration
 _MAX_CELLS = 12_000_000  # maximum of poses × markers: mistyped pose numbers must not fill the memory
-_OF_VIEW = re.compile(f"u_({VIEW_NAME})")  # column of pixels u of a view; that of v follows
+_OF_VIEW = re.compile(f"u_({VIEW_NAME})")  # column of pixels u of a view; v follows
 _DETECTION = ("pose", "camera", "marker", "u", "v")  # columns of a list of detections
 _MOVING = "moving"  # column of the number of a motion
 _T_Q = "t_q"  # column of the time of the joint readings, s
-_IDENTITY = " of "  # in that column, before the identity of the robot
+_IDENTITY = " of "  # precedes the identity of the robot in that column
 _XYZ = ("x", "y", "z")  # columns of a position, m
 _MOUNT = "mount"  # column of the mount of the cameras
 _RECORDING = "recording"  # column of the recording that a row belongs to
@@ -96,7 +96,7 @@ def read_table(
     stated = sheet.has_all([f"sigma_{view}" for view in sheet.views])
     times_of = [_T_Q, *(f"t_{view}" for view in sheet.views)]
     readings: dict[int, tuple[int, dict[str, float | None]]] = {}
-    lines: dict[int, dict[int, int]] = {}  # of each marker at each pose
+    lines: dict[int, dict[int, int]] = {}  # line of each marker at each pose
     rows, seen = array("q"), array("d")  # pose and marker; pixels, then their deviations
     for row in sheet.rows():
         pose, marker = row.integer("pose"), row.integer("marker")
@@ -229,7 +229,7 @@ def read_joint_list(
     flange: bool = False,
     like: Calibration | None = None,
 ) -> JointList:
-    """Read a list of joint readings, one pose a row: columns ``q1 … qN``, optionally ``pose, left, right``.
+    """Read a list of joint readings, one pose per row: columns ``q1 … qN``, optionally ``pose, left, right``.
 
     view : names of the views, which columns with names of their images have; by default left and right.
     joint_types : as for an observation table.
@@ -291,12 +291,12 @@ def recording_of(path: Path | str) -> str | None:
 
 
 def identity_in(path: Path | str) -> str:
-    """Identity of the robot that a table was recorded with; empty where it names none."""
+    """Identity of the robot that a table was recorded with; empty if it names none."""
     return (_recording(path) or "").partition(_IDENTITY)[2]
 
 
 def mount_in(path: Path | str, frame: str | None = None) -> str:
-    """Mount of the cameras, world or tool, as the first row of a table states it; world where none does.
+    """Mount of the cameras, world or tool, as the first row of a table states it; world if none does.
 
     frame : text of a frame that is in no file, which ``path`` then only names.
     """
@@ -509,7 +509,7 @@ class _Sheet:
         of_file = lines_of(path, "a table as UTF-8 CSV", _MAX_BYTES)
         lines = of_file if frame is None else iter(io.StringIO(frame, newline=""))
         first, self._skipped = next(lines, ""), 0
-        if first.strip().lower().startswith("sep="):  # of spreadsheets, for their own eyes
+        if first.strip().lower().startswith("sep="):  # written by spreadsheets for themselves
             first, self._skipped = next(lines, ""), 1
         self._separator = max(",;\t", key=first.count)
         self._reader = csv.reader(
@@ -604,7 +604,7 @@ class _Sheet:
             line = self._reader.line_num + self._skipped
             if len(cells) != self._width:
                 raise InputError(
-                    f"{self._place(line)}: {len(cells)} cells where the header has {self._width}; the row is "
+                    f"{self._place(line)}: {len(cells)} cells, but the header has {self._width}; the row is "
                     "cut short or malformed"
                 )
             row = _Row({name: cells[i].strip() for name, i in self.columns.items()})

@@ -96,7 +96,7 @@ class Result:
     configuration: str  # resolved YAML
     provenance: Mapping[str, Any]  # versions, host, date and so on; JSON values
     inputs: Mapping[str, str]  # files read and their hashes
-    records: Mapping[str, Any]  # the records by name; the name "" stands for the only one
+    records: Mapping[str, Any]  # the records by name; the name "" means the only one
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,7 +106,7 @@ class Run:
     path: Path
     configuration: str = ""
     results: Mapping[str, Result] = dataclasses.field(default_factory=dict)
-    refuted: str = ""  # what contradicted the recording of its calibration since, in words
+    refuted: str = ""  # a later contradiction of its calibration's recording, in words
     # Bytes of the last write, and the results in them.
     written: tuple[bytes, Mapping[str, Result]] = dataclasses.field(
         default=(b"", {}), repr=False, compare=False
@@ -164,7 +164,7 @@ def run_path(target: Path | str) -> Path:
 def save(run: Run) -> Run:
     """Replace the run file at ``run.path``, and return the run with the bytes written.
 
-    A save adds results to those of the last write if none of these changed, in 0.1 s each: a chain of eight
+    A save adds results to the last write if none of these changed, in 0.1 s each: a chain of eight
     results spends a quarter of the time of complete writes.
     """
     image, written = run.written
@@ -190,7 +190,7 @@ def save(run: Run) -> Run:
 
 
 def stored(target: Path | str) -> Run:
-    """Read a run file as ``load`` does; an empty run where there is none yet."""
+    """Read a run file as ``load`` does; an empty run if there is none yet."""
     path = run_path(target)
     return load(path) if path.exists() or (path.parent / SWEEP).is_file() else Run(path)
 
@@ -448,7 +448,7 @@ def load_record(group: h5py.Group, kind: Any, sizes: dict[str, int]) -> Any:
         elif not stored and (optional or has_default(field)):
             values[name] = field.default if has_default(field) else None
         elif not stored and name in lacking:
-            continue  # with its part, or the part cannot be made
+            continue  # read with its part, or the part cannot be made
         elif dims is None:
             values[name] = _value(name, attribute(group, name), inner)
         else:

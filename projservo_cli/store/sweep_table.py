@@ -26,10 +26,10 @@ if typing.TYPE_CHECKING:
     import h5netcdf
 
 _SCHEMA = "projservo sweep"
-_VERSION = 4  # of the layout of a table
+_VERSION = 4  # version of the table layout
 _AGAIN = "move it elsewhere and run the sweep again"
 TABLE = SWEEP
-_ROWS = 16_384  # of a chunk of the file
+_ROWS = 16_384  # rows per chunk of the file
 _TEXT = 48  # bytes that the name of a law or a verdict takes in it
 _PACKED = {"compression": "gzip", "compression_opts": 1, "shuffle": True, "fletcher32": True}
 _TRACES = "traces"
@@ -167,7 +167,7 @@ class SweepTable:
             is_json = ("{", "[")
             self.attributes = {k: json.loads(v) if str(v).startswith(is_json) else v for k, v in found}
             self.names = tuple(self.attributes["columns"])
-            self.failures = _failures(self.attributes.get(_FAILURES, {}))  # by law
+            self.failures = _failures(self.attributes.get(_FAILURES, {}))  # failures by law
             self.rows = len(file["run"])
             self.traces = tuple(sorted(map(int, file.get(_TRACES, ()))))  # numbers of runs
         self._read: dict[str, _Array] = {}
@@ -178,7 +178,7 @@ class SweepTable:
         return [(name, values) for name, values in self.attributes["axes"]]
 
     def __getitem__(self, name: str) -> _Array:
-        """A column, or what follows from some, read once."""
+        """A column, or values derived from some, read once."""
         if name not in self._read:
             self._read[name] = self._derived(name)
         return self._read[name]
@@ -217,7 +217,7 @@ class SweepTable:
             data = file[name]
             if data.dtype.kind != "O":
                 return np.asarray(data[()])
-            texts = data.asstr()  # of any length, a few at a time
+            texts = data.asstr()  # texts of any length, a few at a time
             return np.concatenate(
                 [texts[i : i + _ROWS].astype(str) for i in range(0, max(len(data), 1), _ROWS)]
             )

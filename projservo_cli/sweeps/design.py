@@ -42,7 +42,7 @@ _PROBES = 4  # values that show whether a calibration depends on them
 
 
 def _sample(distribution: Distribution, rng: np.random.Generator) -> Any:
-    """One value; always as many random numbers, whatever the distribution."""
+    """One value; as many random numbers for any distribution."""
     uniform, normal = rng.random(), rng.standard_normal()
     match distribution:
         case Distribution(uniform=(low, high)):
@@ -56,7 +56,7 @@ def _sample(distribution: Distribution, rng: np.random.Generator) -> Any:
 
 
 class _Axis(NamedTuple):
-    """One dimension of the grid: its name, the keys it sets, its values, and what goes with some of them."""
+    """One dimension of the grid: its name, the keys it sets, its values, and further keys of some of them."""
 
     name: str
     keys: tuple[str, ...]
@@ -64,7 +64,7 @@ class _Axis(NamedTuple):
     also: Mapping[str, Mapping[str, Any]] = {}
 
     def changes(self, value: Any) -> Iterator[Override]:
-        """Yield the overrides of one of the values; that of a law sets its mode too if its name has one."""
+        """Yield the overrides of one of the values; a law sets its mode too if its name has one."""
         what = f"grid.{self.name}"
         for key in self.keys:
             change = _override(what, key, value)
@@ -138,7 +138,7 @@ class Design:
 
     @cached_property
     def sources(self) -> dict[str, str]:
-        """Hashes of the sources of laws of one's own, by ``module:Class``; empty where one is gone."""
+        """Hashes of the sources of the user's laws, by ``module:Class``; empty if one is gone."""
         names = {value for axis in self.axes if LAW in axis.keys for value in axis.values}
         names |= {changed[LAW] for axis in self.axes for changed in axis.also.values() if LAW in changed}
         own = {law_and_mode(str(name))[0] for name in names if ":" in str(name)}
@@ -205,14 +205,14 @@ class Design:
         """Hash of all a calibration depends on; cells that share it share the calibration."""
         return key_of(calibration_inputs(self.calibrated(cell, calibration)))
 
-    def _places(self) -> Iterator[tuple[int, int]]:
+    def _cells_numbers(self) -> Iterator[tuple[int, int]]:
         """Each cell with the number of each of its calibrations."""
         return product(range(self.cells), range(min(self.sweep.calibrations, self.sweep.runs)))
 
     def calibrations(self) -> ItemsView[str, Config]:
         """Key of each calibration that is needed, each once, and a configuration that needs it."""
         needed: dict[str, Config] = {}
-        for place in self._places():
+        for place in self._cells_numbers():
             needed.setdefault(self.calibration_key(*place), self.calibrated(*place))
         return needed.items()
 
@@ -220,7 +220,7 @@ class Design:
         """Keys of the calibrations of which a run needs the covariance, each 0.1 MB."""
         return {
             self.calibration_key(cell, number)
-            for cell, number in self._places()
+            for cell, number in self._cells_numbers()
             if self.cell(cell).trajectory.needs_covariance
         }
 
@@ -242,15 +242,15 @@ class Design:
         _, start = _motion_of(f"base {base}", config)
         q_front = np.array(start.values(config.joint_types or ""))
         rng = np.random.default_rng(self._stream(_TASKS))
-        least_views = config.trajectory.least_views or 0
+        min_views = config.trajectory.min_views or 0
         low, high = np.radians(tasks.rotation_deg)
-        ends = random_tasks(truth_of(config), q_front, tasks.random, rng, least_views, (low, high))
+        ends = random_tasks(truth_of(config), q_front, tasks.random, rng, min_views, (low, high))
         joints = ([JointVector(joints=tuple(q), unit="rad") for q in end.tolist()] for end in ends)
         return list(zip(*joints, strict=True))
 
     @lru_cache(maxsize=1024)  # noqa: B019 - a process has one design
     def listed(self, base: int, number: int) -> TaskSettings:
-        """Return a listed task, with the keys of that of a base which it does not give."""
+        """Return a listed task, with missing keys from the task of a base."""
         config, where = self.cell(self.cells_of(base)[0]), f"tasks.listed[{number}]"
         task, _ = _motion_of(where, config)
         given = task.model_dump(mode="json", exclude_defaults=True) | self.sweep.listed_tasks[number]
@@ -347,13 +347,13 @@ def _motion_of(where: str, config: Config) -> tuple[TaskSettings, JointVector]:
     if task is None or task.steps or task.start_joints is None:
         raise InputError(
             f"{where}: a run of a sweep is one motion from given joints: set task.start, and leave "
-            "task.steps out; the motions of a sequence may stand one by one in tasks.listed"
+            "task.steps out; the motions of a sequence may be listed one by one in tasks.listed"
         )
     return task, task.start_joints
 
 
 def name_of_run(config: Config) -> str:
-    """Name of the only run of a configuration: its law, with the mode where it follows the plan."""
+    """Name of the only run of a configuration: its law, with the mode if it follows the plan."""
     names = run_names(config.control.laws, config.control.mode)
     if len(names) != 1:
         raise InputError(

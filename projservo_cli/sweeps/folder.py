@@ -1,6 +1,6 @@
 """The folder of a sweep: its manifest, progress and results, and the repetition of one run.
 
-A manifest says what all else is of. While a sweep runs there is a file for each part; a part that is there
+A manifest describes the rest. While a sweep runs there is a file for each part; a part that is there
 is done, so after any end the same command goes on with the others. The table is assembled from them, and
 when it is complete they are removed. Calibrations stay, to repeat any run.
 """
@@ -36,14 +36,14 @@ from projservo_cli.sweeps.runs import Part, columns_of, is_compiled, run_part
 from projservo_cli.sweeps.workers import Engine, versions
 
 _REFUSED = ".refused"  # a calibration that cannot be made leaves a file with the reason
-_PARTS = 4  # of each worker at least
+_PARTS = 4  # minimum number per worker
 # Runs that take a second or two, by whether many have all but their images in common.
 _SHARED, _OWN = 2_000, 100
 _CALIBRATIONS = 8  # that one process makes in less time than it takes to start another
 _SETTINGS = 64  # as many of a cell, and a part has many runs of each, nearly all of whose time is compiled
 
 
-_Records = tuple[Observation, Calibration, CrossValidation | None]  # of a calibration
+_Records = tuple[Observation, Calibration, CrossValidation | None]  # records of a calibration
 
 
 class _Status(NamedTuple):
@@ -56,7 +56,7 @@ class _Status(NamedTuple):
 
 
 class Folder:
-    """The folder of a sweep, by its name or by that of its table."""
+    """The folder of a sweep, by its name or its table's."""
 
     def __init__(self, target: Path | str) -> None:
         path = Path(target)
@@ -102,7 +102,7 @@ class Folder:
         return _Status(total - left, total, chunk)
 
     def _chunk(self, design: Design) -> int:
-        """Return the runs of a part; refuse those of another configuration, or of other versions."""
+        """Return the runs of a part; refuse runs of another configuration, or of other versions."""
         manifest, now = self._read(), versions()
         if manifest["key"] != design.key:
             raise InputError(
@@ -126,7 +126,7 @@ class Folder:
         return int(manifest["chunk"])
 
     def _read(self) -> dict[str, Any]:
-        """Key and recipe of the design, runs a part, and versions."""
+        """Key and recipe of the design, runs per part, and versions."""
         if not self.manifest.exists():
             raise InputError(f"{self.path}: holds no sweep; make one with projservo sweep -c FILE")
         try:
@@ -200,7 +200,7 @@ class Folder:
         save(Run(path, stored_yaml(config), {"calibrate": result_of(step, config, *made)}))
 
     def calibrations(self, design: Design) -> dict[str, Calibration | None]:
-        """Calibrations by their key, None where one was refused; with covariance where a plan needs it."""
+        """Calibrations by their key, None if one was refused; with covariance if a plan needs it."""
         found: dict[str, Calibration | None] = {}
         whole = design.with_covariance()
         for key, _ in design.calibrations():
@@ -210,7 +210,7 @@ class Folder:
 
 
 def run_of(target: str) -> tuple[Config, Result | None]:
-    """Configuration of the run SWEEP:INDEX, and its calibration, None where the sweep has not come to it."""
+    """Configuration of the run SWEEP:INDEX, and its calibration, None if the sweep has not come to it."""
     sweep, _, index = target.rpartition(":")
     if not sweep or not index.isdecimal():
         raise InputError(f"--from {target}: expected SWEEP:INDEX, such as results/sweep_noise:17")
@@ -245,7 +245,7 @@ def run_sweep(
     if force:
         folder.clear()
     try:
-        columns_of(design)  # or say why there can be no table, before anything else is made
+        columns_of(design)  # fails early if there can be no table
         for base in range(len(design.bases)):
             design.random_ends(base)  # likewise
         _compile_once(design, engine, say)
@@ -274,8 +274,8 @@ def _make_parts(design: Design, folder: Folder, engine: Engine, status: _Status,
     calibrations, threads = folder.calibrations(design), _shares_settings(design)
     chunk = status.chunk
     if not chunk:
-        most = _SHARED if threads else _OWN
-        chunk = design.sweep.chunk or min(most, math.ceil(design.total / (_PARTS * engine.workers)))
+        max_chunk = _SHARED if threads else _OWN
+        chunk = design.sweep.chunk or min(max_chunk, math.ceil(design.total / (_PARTS * engine.workers)))
         folder.begin(design, chunk)
 
     def part(first: int, last: int) -> Part:
@@ -305,13 +305,13 @@ def _shares_settings(design: Design) -> bool:
 
 
 def _in_kernel(design: Design, cell: int) -> bool:
-    """Whether the kernel of whole runs makes those of a cell."""
+    """Whether the kernel of whole runs makes the runs of a cell."""
     config = design.cell(cell)
     return is_compiled(design, servo_inputs(config), name_of_run(config))
 
 
 def _calibrate(wanted: tuple[str, Config]) -> tuple[str, Config, _Records | str]:
-    """Make the calibration of a key, or tell why there is none; on one thread, to be the same to the bit."""
+    """Make the calibration of a key, or report its failure; one thread makes it the same to the bit."""
     with threadpool_limits(1):
         try:
             return (*wanted, calibrate.run(inputs_of("calibrate", wanted[1])))

@@ -41,7 +41,7 @@ _NOT_CALIBRATED, _NOT_STARTED = "not calibrated", "not started"
 # Reason of a compiled run that did not start.
 _UNMEASURED = "its images of start and goal do not show the task"
 _LONGEST = 300  # characters of a reason that is kept
-_NONE = -1  # in columns of counts, where a run did not begin
+_NONE = -1  # value of counts, if a run did not begin
 
 
 def _text(name: str, values: Sequence[str], about: str) -> Heading:
@@ -54,7 +54,7 @@ NUMBERED = (
     Heading("cell", "i8", "1", "number of its cell of the grid"),
     Heading("draw", "i8", "1", "number of the run in its cell; runs of one number share task and noise"),
     Heading("calibration", "i8", "1", "number of the calibration in the cell"),
-    Heading("task", "i8", "1", "number of the random task, -1 for that of the base"),
+    Heading("task", "i8", "1", "number of the random task, -1 for the task of the base"),
     Heading("seed", "i8", "1", "seed of the run"),
 )
 
@@ -78,7 +78,7 @@ def measured_columns(view: Sequence[str] = VIEWS) -> tuple[Heading, ...]:
             "the face and every marker of the face in both images",
         ),
         Heading("usable", "i1", "1", "whether its calibration is usable"),
-        Heading("steps", "i8", "1", "commands sent, -1 where the run did not begin"),
+        Heading("steps", "i8", "1", "commands sent, -1 if the run did not begin"),
         Heading("rotation_deg", "f8", "deg", "true rotation from start to goal"),
         Heading("distance_mm", "f8", "mm", "true distance of the centre from start to goal"),
         Heading("position_error_mm", "f8", "mm", "true centre to true goal at the end"),
@@ -124,7 +124,7 @@ def columns_of(design: Design) -> tuple[Heading, ...]:
 
 
 def _input(name: str, values: Sequence[Any], about: str) -> Heading:
-    """A column of values that are given: of numbers where all are, else of texts."""
+    """A column of values that are given: of numbers if all are, otherwise of texts."""
     displayed = [_displayed(value) for value in values]
     if any(isinstance(value, str) for value in displayed):
         return _text(name, [str(value) for value in displayed], about)
@@ -132,7 +132,7 @@ def _input(name: str, values: Sequence[Any], about: str) -> Heading:
 
 
 def _displayed(value: Any) -> Any:
-    """Numbers and texts as they are, everything else as text."""
+    """Numbers and texts as they are, other values as text."""
     return value if type(value) in (int, float, str) else json.dumps(value)
 
 
@@ -147,7 +147,7 @@ class Part(NamedTuple):
     design: Design
     first: int
     last: int
-    calibrations: Mapping[str, Calibration | None]  # by their key; None where there could be none
+    calibrations: Mapping[str, Calibration | None]  # calibrations by key; None if there could be none
 
 
 class _Made(NamedTuple):
@@ -155,18 +155,18 @@ class _Made(NamedTuple):
 
     columns: _Columns
     traces: dict[int, Trace]
-    failures: dict[str, Failure]  # by the name of the law
+    failures: dict[str, Failure]  # failures by the name of the law
 
 
 def run_part(part: Part) -> _Made:
-    """Make the runs of a part; the same on any machine of one kind, whatever ran before."""
+    """Make the runs of a part; the same on any machine of one kind, after any other runs."""
     design = _interned(part.design)
     runs = np.arange(part.first, part.last)
     table = _numbered(design, runs)
     traces: dict[int, Trace] = {}
     failures: dict[str, Failure] = {}
     wanted = set(design.sweep.traces)
-    with threadpool_limits(1):  # with more, sums may be taken in another order
+    with threadpool_limits(1):  # more threads may change the order of sums
         for these in _alike(design, runs):
             rows = these - part.first
             first = int(these[0])

@@ -56,7 +56,7 @@ def _of_runs(table: SweepTable, these: BoolArray) -> dict[str, Any]:
 
 
 def _quantiles(values: npt.NDArray[Any]) -> dict[str, float | None]:
-    """Quantiles of values that are numbers; None where there is none."""
+    """Quantiles of values that are numbers; None if there is none."""
     numbers = values[np.isfinite(values)]
     found = np.quantile(numbers, _QUANTILES).tolist() if len(numbers) else [None] * len(_QUANTILES)
     return {f"{share:g}": value for share, value in zip(_QUANTILES, found, strict=True)}
@@ -79,7 +79,7 @@ def _paired(table: SweepTable, laws: Sequence[str] | None = None) -> Iterator[di
 
 
 def _compared(table: SweepTable, one: BoolArray, other: BoolArray) -> dict[str, Any]:
-    """Runs of two laws that share their draws: how often which succeeds, and differences where both do.
+    """Runs of two laws that share their draws: how often which succeeds, and differences if both do.
 
     The probabilities are of the exact test of McNemar and of the sign test: how often a difference as
     large or larger would come about between laws that are alike.
@@ -109,7 +109,7 @@ def _chance(first: int, second: int) -> float:
 
 
 def _drawn(data: Any, draw: Any) -> Any:
-    """Draw a figure in its size; that of the basin is the larger one."""
+    """Draw a figure in its size; the basin has the larger one."""
     height, width = (4.0, style.WIDTH) if draw is draw_basin else (2.9, 0.65 * style.WIDTH)
     return style.drawn(draw, data, height, width)
 
@@ -173,7 +173,7 @@ class Study(Displayable):
     def success(self) -> list[dict[str, Any]]:
         """Return for each cell its values, ``runs``, ``successes``, ``success_rate`` and its interval.
 
-        ``success_interval`` is that of Wilson, of 95 %; ``quantiles`` are of runs that succeeded.
+        ``success_interval`` is Wilson's, of 95 %; ``quantiles`` are of runs that succeeded.
         """
         table = self._table
         return [self._named(table.values(cell)) | _of_runs(table, these) for cell, these in table.cells()]
@@ -188,7 +188,7 @@ class Study(Displayable):
         Returns
         -------
         ``pairs``; ``both``, ``only`` (first, second) and ``neither`` succeeded; ``p_success`` of the exact
-        test of McNemar; ``median_difference`` first less second where both succeed, and ``p_difference`` of
+        test of McNemar; ``median_difference`` first less second if both succeed, and ``p_difference`` of
         the sign test, by measure.
 
         Raises
@@ -241,12 +241,12 @@ class Study(Displayable):
         values = {"runs": f"{len(self.table['run'])} in {len(cells)} cells"}
         failures = [*self._table.failures.items()][:_SHOWN_FAILURES]
         values |= {f"failures of {self._names.get(law, law)}": one.words for law, one in failures}
-        shown = _SHOWN - len(failures)
-        for cell in cells[:shown]:
+        n_named = _SHOWN - len(failures)
+        for cell in cells[:n_named]:
             low, high = cell["success_interval"]
             place = ", ".join(f"{name} {cell[name]}" for name, _ in self._table.axes)
             values[place] = f"{cell['success_rate']:.1%} of {cell['runs']} succeed ({low:.1%} to {high:.1%})"
-        return values | ({"more": f"{len(cells) - shown} cells"} if len(cells) > shown else {})
+        return values | ({"more": f"{len(cells) - n_named} cells"} if len(cells) > n_named else {})
 
     def _named(self, values: dict[str, Any]) -> dict[str, Any]:
         return values | ({"law": self._names.get(values["law"], values["law"])} if "law" in values else {})

@@ -1,7 +1,7 @@
 """Workers of the jobs of a sweep: here, in threads or processes of this machine, or on a Dask cluster.
 
-Plain ``concurrent.futures`` and ``distributed``: results of joblib pile up where they are stored more slowly
-than made, Ctrl-C prints what its processes were at, and they outlive a sweep that is killed.
+Plain ``concurrent.futures`` and ``distributed``: results of joblib pile up if they are stored more slowly
+than made, Ctrl-C prints the work of its processes, and they outlive a sweep that is killed.
 """
 
 import logging
@@ -33,16 +33,17 @@ from projservo_cli.records import InputError, WorkFailed
 _Job = TypeVar("_Job")
 _Result = TypeVar("_Result")
 
-MOST_LOSSES = 5  # of workers in a row, without a job done in between
+MOST_LOSSES = 5  # losses of workers in a row, without a finished job
 _PATIENCE_S = 10.0  # for the scheduler to answer and for a first worker
 _DECISIVE = ("projservo", "python", "numpy", "scipy", "numba", "jit")  # for the last digits of a result
 
 
 class Engine:
-    """So many workers of this machine; a single one is this process."""
+    """Workers of this machine; a single one is this process."""
 
     here = True
-    losses: tuple[type[Exception], ...] = (BrokenExecutor, CancelledError, OSError)  # of workers
+    # errors that mean lost workers
+    losses: tuple[type[Exception], ...] = (BrokenExecutor, CancelledError, OSError)
 
     def __init__(self, workers: int) -> None:
         self.workers = workers
@@ -60,7 +61,7 @@ class Engine:
         No more jobs wait than keep all workers busy, and a result is released at the next request.
 
         max_workers : workers that the jobs are worth.
-        threads : whether they seldom wait for each other; the memory is that of one process then.
+        threads : whether they seldom wait for each other; the memory is then of one process.
         """
         workers = min(self.workers, max_workers or self.workers)
         if self.here and workers == 1:
@@ -106,7 +107,7 @@ class Engine:
     def pool(self, workers: int, *, threads: bool) -> Iterator[Executor]:
         """Workers to submit jobs to; in the end processes go at once, threads with the jobs they are at."""
         if threads:
-            # One limit for all threads together, or one would end that of another.
+            # One limit for all threads together, or one would end another's.
             with threadpool_limits(1), ThreadPoolExecutor(workers) as of_threads:
                 yield of_threads
             return
@@ -119,7 +120,7 @@ class Engine:
             for process in processes:
                 process.terminate()
             # One that ended amid a result leaves a part of it, for the rest of which this process would wait.
-            results._writer.close()  # type: ignore[attr-defined]  # no name of its own closes it
+            results._writer.close()  # type: ignore[attr-defined]  # no public name closes it
 
     def check(self) -> None:
         """Raise WorkFailed if no result can arrive; a pool of this machine raises by itself."""
@@ -175,7 +176,7 @@ class Cluster(Engine):
         """Refuse workers whose results would differ in their last digits."""
         try:
             found = self._client.run(versions)
-        except Exception as error:  # whatever unpickling raises there
+        except Exception as error:  # any error of unpickling there
             what = " ".join(str(error).split())
             raise InputError(
                 f"{self._name}: a worker cannot import projservo ({what}): install the same "
@@ -195,7 +196,7 @@ class Cluster(Engine):
         yield self._client.get_executor(retries=MOST_LOSSES, pure=False)
 
     def check(self) -> None:
-        """Raise WorkFailed where the scheduler is gone."""
+        """Raise WorkFailed if the scheduler is gone."""
         for _ in range(20):  # a lost connection is noticed a moment after its lost jobs
             if self._client.status != "running":
                 raise WorkFailed(

@@ -30,7 +30,7 @@ from projservo_cli.records import BoolArray, FloatArray, Model
 
 _Vec3 = tuple[float, float, float]
 _Row = tuple[float, float, float, float, float, float, float]
-# Products of the columns of (J, e) with those of J, upper triangle by rows.
+# Products of the columns of (J, e) with columns of J, upper triangle by rows.
 _Sums = tuple[
     float, float, float, float, float, float, float, float, float, float, float, float, float, float,
     float, float, float, float, float, float, float, float, float, float, float, float, float,
@@ -51,7 +51,7 @@ class Body(NamedTuple):
     markers; a_inf is the plane at infinity of the translations.
     """
 
-    # (m, 4) markers at the reference, a_inf·M = 1, those of the face first; none if measured point by point
+    # (m, 4) markers at the reference, a_inf·M = 1, the face first; none if measured point by point
     M: FloatArray
     D: FloatArray  # (3, 4) points at infinity, the directions of the translations
     H_hat: FloatArray  # (3, 4, 4) operators of the rotations, per rad
@@ -69,11 +69,12 @@ class _Until(NamedTuple):
     max_steps: int  # number of steps after which the fit is taken as it is
 
 
-# In the loop, by the views in the image of the goal: half a pixel leaves some thousandths, as its square.
+# Limits in the loop, by the views in the image of the goal: half a pixel leaves some thousandths, as its
+# square.
 GOAL_VIEWS = _Until(True, 0.5, 2)
-# In the loop, by all views.
+# Limits in the loop, by all views.
 ALL_VIEWS = _Until(False, 0.5, 2)
-# At the goal, by all views, to round-off.
+# Limits at the goal, by all views, to round-off.
 SETTLED = _Until(False, 1e-6, 30)
 
 
@@ -103,11 +104,11 @@ NO_BODY = Body(
 def make_body(model: Model, M: FloatArray) -> Body:
     """Body of calibrated markers.
 
-    The rotations are those of the joints: the three main directions of their actions on the plane at
+    The rotations follow from the joints: the three main directions of their actions on the plane at
     infinity, orthonormal in the invariant form −½ trace(L L'), hence per rad. If the joints do not turn the
-    body about three directions, the rotations are those of a metric that the joints preserve.
+    body about three directions, the rotations belong to a metric that the joints preserve.
 
-    model : calibrated model; M : (m, 4) its markers at the reference, those of the face first.
+    model : calibrated model; M : (m, 4) its markers at the reference, the face first.
     Raises WorkFailed if the joints preserve no metric of the calibrated frame.
     """
     M = M / (M @ model.a_inf)[:, None]

@@ -1,11 +1,11 @@
 """Displacement of an object that a goal was taught on, and the goal carried along with it.
 
-Its points and displacements are those of ``object_bundle_adjustment``. Where the joints leave the metric
-open, the displacement is affine, for which a look needs four markers off one plane instead of three off one
+Its points and displacements are defined in ``object_bundle_adjustment``. If the joints leave the metric
+open, the displacement is affine, for which a frame needs four markers off one plane instead of three off one
 line.
 
-Errors are those of all images and of the calibration, to first order. A calibration that is off displaces the
-object and the tool alike: what both errors have in common drops out of the images of the carried goal.
+Errors come from all images and from the calibration, to first order. A wrong calibration displaces the
+object and the tool alike: the common part of both errors drops out of the images of the carried goal.
 """
 
 from collections.abc import Callable, Sequence
@@ -55,12 +55,12 @@ _UNSEEN = 0.3
 _UNDECIDED = 13.8
 # Number of minima of a place for known points that the points are then freed from.
 _MINIMA = 3
-# Chance of residuals beyond which they are not those of the same rigid object, and error of a finder that all
-# frames of a look have alike, px: by rendered tags that lie as they did.
+# Chance of residuals beyond which they contradict one rigid object, and error of a finder that all
+# images of an object share, px: by rendered tags that lie as they did.
 _BY_CHANCE, ALIKE_PX = 1e-4, 0.02
 # Chance by which a tag of an object, which lies as it did, seems to have slipped.
 _SLIPPED = 1e-3
-# Of so many markers seen in a look, one that is off by itself may be left out.
+# Number of markers seen in a frame, of which a single outlier may be left out.
 _SHARE = 8
 # Cosine of the angle between the axis of a turn and a line of markers, above which it is about that line.
 _ALONG = 0.95
@@ -70,7 +70,7 @@ class _Placed(NamedTuple):
     """Object at the looks that it has been found in."""
 
     fit: BundleFit
-    looks: tuple[int, ...]  # (L,) indices of the looks
+    frames: tuple[int, ...]  # (L,) indices of the looks
     known: BoolArray  # (k,) markers whose points are known
 
 
@@ -80,33 +80,33 @@ class _Search:
 
     rig: ObjectViewRig
     marker: Sequence[int]  # (k,) numbers of its markers
-    looks: Sequence[ObjectView]
+    frames: Sequence[ObjectView]
 
     @cached_property
     def views(self) -> IntArray:
-        """Number of views (L, k) that see each marker at each look."""
-        return np.array([np.isfinite(look.s).all(axis=-1).sum(axis=0) for look in self.looks])
+        """Number of views (L, k) that see each marker in each frame."""
+        return np.array([np.isfinite(at_frame.s).all(axis=-1).sum(axis=0) for at_frame in self.frames])
 
     @property
     def min_markers(self) -> int:
-        """Number of markers that a look needs."""
+        """Number of markers that a frame needs."""
         return RIGID if self.rig.rigid else _AFFINE
 
-    def of(self, markers: BoolArray, name: str = "", look: int | None = None) -> Subject:
+    def of(self, markers: BoolArray, name: str = "", at_frame: int | None = None) -> Subject:
         """Markers (k,) as the subject of a finding, with the time or the number of the look at them."""
-        poses = () if look is None else (look + 1,)
+        poses = () if at_frame is None else (at_frame + 1,)
         return Subject(markers=tuple(np.asarray(self.marker)[markers].tolist()), name=name, poses=poses)
 
-    def bundle(self, looks: Sequence[int], markers: BoolArray, X: FloatArray, fixed: int = -1) -> Bundle:
-        """Least squares of looks at markers (k,) near points (k, 4); of known points if no look is fixed."""
+    def bundle(self, frames: Sequence[int], markers: BoolArray, X: FloatArray, fixed: int = -1) -> Bundle:
+        """Least squares of frames of markers (k,) near points (k, 4); known points if no frame is fixed."""
         E = generators(self.rig.linear, X[markers, :3].mean(axis=0))
-        return self.rig.bundle([self.looks[i].of(markers) for i in looks], E, fixed)
+        return self.rig.bundle([self.frames[i].of(markers) for i in frames], E, fixed)
 
-    def points(self, look: int, T: FloatArray) -> FloatArray:
-        """Points (k, 4) that two views or more see at a look, in the frame that T displaces; others NaN."""
-        s, X = undistort(self.rig.lens[0], self.looks[look].s), np.full((len(self.marker), 4), np.nan)
+    def points(self, at_frame: int, T: FloatArray) -> FloatArray:
+        """Points (k, 4) that two views or more see in a frame, in the frame that T displaces; others NaN."""
+        s, X = undistort(self.rig.lens[0], self.frames[at_frame].s), np.full((len(self.marker), 4), np.nan)
         P = self.rig.P[0] @ T
-        for k in np.flatnonzero(self.views[look] > 1):
+        for k in np.flatnonzero(self.views[at_frame] > 1):
             rows = (P[:, :2] - s[:, k, :, None] * P[:, 2:])[np.isfinite(s[:, k, 0])].reshape(-1, 4)
             X[k] = homogeneous(np.linalg.lstsq(rows[:, :3], -rows[:, 3])[0])
         return X
@@ -120,54 +120,54 @@ class _Search:
         X = self.points(base, np.eye(4))
         known = np.isfinite(X[:, 0])
         if known.sum() < self.min_markers:
-            alone = len(self.looks[0].s) == 1
-            of = Subject() if alone else self.of(known, look=base)
+            alone = len(self.frames[0].s) == 1
+            of = Subject() if alone else self.of(known, at_frame=base)
             code = "object_without_size" if alone else "object_without_shape"
             raise unknown(Finding(code, REFUSES, of, float(known.sum()), limit=self.min_markers, unit="1"))
         fit = BundleFit.settled(self.bundle([base], known, X, 0), X[known], np.eye(4)[None])
-        placed, last = _Placed(fit, (base,), known), len(self.looks) - 1
-        for look in dict.fromkeys((last, 0, *range(1, last))):
+        placed, last = _Placed(fit, (base,), known), len(self.frames) - 1
+        for at_frame in dict.fromkeys((last, 0, *range(1, last))):
             try:
-                placed = placed if look == base else self._with(placed, look)
+                placed = placed if at_frame == base else self._with(placed, at_frame)
             except WorkFailed:
-                if look in (0, last):
+                if at_frame in (0, last):
                     raise
         return placed
 
-    def _with(self, placed: _Placed, look: int) -> _Placed:
+    def _with(self, placed: _Placed, at_frame: int) -> _Placed:
         """The object with one more look at it."""
-        when = _TAUGHT if look == 0 else _NOW
+        when = _TAUGHT if at_frame == 0 else _NOW
         X = np.full((len(self.marker), 4), np.nan)
         X[placed.known] = placed.fit.X
-        shown = placed.known & (self.views[look] > 0)
-        if shown.sum() < self.min_markers:
-            of, seen = self.of(shown, when), float(shown.sum())
+        visible = placed.known & (self.views[at_frame] > 0)
+        if visible.sum() < self.min_markers:
+            of, seen = self.of(visible, when), float(visible.sum())
             raise unknown(Finding("object_hidden", REFUSES, of, seen, limit=self.min_markers, unit="1"))
         found = []
         for start in self._structures(placed, X):
-            T, _ = self.bundle([look], shown, start).poses(start[shown], self.rig.turns)
-            found += [self._joined(placed, look, start, there) for there in T[:_MINIMA]]
+            T, _ = self.bundle([at_frame], visible, start).poses(start[visible], self.rig.turns)
+            found += [self._joined(placed, at_frame, start, there) for there in T[:_MINIMA]]
         if not found:
-            raise unknown(Finding("object_unplaced", REFUSES, self.of(shown, when)))
+            raise unknown(Finding("object_unplaced", REFUSES, self.of(visible, when)))
         best, *others = sorted(found, key=lambda one: one.fit.cost)
-        at_look = best.looks.index(look)
-        deviation, axis = best.fit.unseen(at_look)
+        in_frame = best.frames.index(at_frame)
+        deviation, axis = best.fit.unseen(in_frame)
         if deviation > _UNSEEN:
-            raise unknown(self._not_seen(best, self.of(shown, when), deviation, axis))
+            raise unknown(self._not_seen(best, self.of(visible, when), deviation, axis))
         for other in others:
             apart = other.fit.cost - best.fit.cost
-            ends = [one.fit.T[at_look] @ X[shown].T for one in (best, other)]
+            ends = [one.fit.T[in_frame] @ X[visible].T for one in (best, other)]
             if apart < _UNDECIDED and differ(ends[0].T, ends[1].T):
-                of = self.of(shown, when)
+                of = self.of(visible, when)
                 raise unknown(Finding("object_in_two_places", REFUSES, of, apart, limit=_UNDECIDED))
         return best
 
     def _structures(self, placed: _Placed, X: FloatArray) -> list[FloatArray]:
-        """Points (k, 4) to start from: those known, and with one look alone their reversal in depth.
+        """Points (k, 4) to start from: those known, and with one frame alone their reversal in depth.
 
-        Images of a small object far away hardly tell the two apart, nor does a short baseline.
+        Images of a small object far away hardly separate the two, nor does a short baseline.
         """
-        if len(placed.looks) > 1 or not self.rig.rigid:
+        if len(placed.frames) > 1 or not self.rig.rigid:
             return [X]
         middle = placed.fit.X[:, :3].mean(axis=0)
         depth = middle - optical_centers(self.rig.P[0], np.array([0.0, 0.0, 0.0, 1.0]))[:, :3].mean(axis=0)
@@ -176,41 +176,41 @@ class _Search:
         reversed_[:, :3] -= 2.0 * np.outer((X[:, :3] - middle) @ depth, depth)
         return [X, reversed_]
 
-    def _joined(self, placed: _Placed, look: int, X: FloatArray, there: FloatArray) -> _Placed:
+    def _joined(self, placed: _Placed, at_frame: int, X: FloatArray, there: FloatArray) -> _Placed:
         """The minimum with one more look, from points (k, 4) and their displacement (4, 4) there."""
-        at = sorted([*zip(placed.looks, placed.fit.T, strict=True), (look, there)], key=itemgetter(0))
-        looks = tuple(i for i, _ in at)
-        points = np.where(placed.known[:, None], X, self.points(look, there))
+        at = sorted([*zip(placed.frames, placed.fit.T, strict=True), (at_frame, there)], key=itemgetter(0))
+        frames = tuple(i for i, _ in at)
+        points = np.where(placed.known[:, None], X, self.points(at_frame, there))
         known = np.isfinite(points[:, 0])
-        bundle = self.bundle(looks, known, points, looks.index(placed.looks[placed.fit.bundle.fixed]))
+        bundle = self.bundle(frames, known, points, frames.index(placed.frames[placed.fit.bundle.fixed]))
         fit = BundleFit.settled(bundle, points[known], np.array([place for _, place in at]))
-        return _Placed(fit, looks, known)
+        return _Placed(fit, frames, known)
 
-    def _not_seen(self, placed: _Placed, shown: Subject, std: float, axis: FloatArray) -> Finding:
+    def _not_seen(self, placed: _Placed, visible: Subject, std: float, axis: FloatArray) -> Finding:
         """Return the freedom that images leave, by the direction (3 or 9,) of its largest deviation."""
         if not self.rig.rigid:
-            return Finding("object_stretched", REFUSES, shown, std, limit=_UNSEEN, unit="1")
+            return Finding("object_stretched", REFUSES, visible, std, limit=_UNSEEN, unit="1")
         numbers, X = np.asarray(self.marker)[placed.known], placed.fit.X[:, :3]
         lines = X[:, None] - X
         cosine = np.abs(lines @ axis) / np.maximum(np.linalg.norm(lines, axis=-1), 1e-300)
         i, j = sorted(np.unravel_index(int(np.argmax(cosine)), cosine.shape))
         line = (Finding("object_line", subject=Subject(markers=(int(numbers[i]), int(numbers[j])))),)
         about = line if cosine[i, j] > _ALONG else ()
-        at_most = min(std, np.pi)
-        return Finding("object_turned", REFUSES, shown, at_most, limit=_UNSEEN, unit="rad", others=about)
+        capped = min(std, np.pi)
+        return Finding("object_turned", REFUSES, visible, capped, limit=_UNSEEN, unit="rad", others=about)
 
 
 class _Off(NamedTuple):
     """Markers that do not lie as they did, beyond chance by noise and calibration."""
 
     times: float
-    most: float  # times, most: residuals over the noise, and at most by chance
-    look: int
-    markers: tuple[int, ...]  # look, markers: of the one that is off most, or of a tag that moved by itself
+    max_times: float  # times, most: residuals over the noise, and at most by chance
+    at_frame: int
+    markers: tuple[int, ...]  # frame, markers: the largest outlier, or a tag that moved by itself
 
 
 class _Left(NamedTuple):
-    """Residuals (N,) that a fit leaves of its images, over their deviation, with those of errors alike."""
+    """Residuals (N,) of the images of a fit, over their deviation, with residuals of shared errors."""
 
     r: FloatArray
     J: FloatArray  # (N, p) by the coordinates of the fit
@@ -235,30 +235,30 @@ class _Left(NamedTuple):
 def _elsewhere(rig: ObjectViewRig, fit: BundleFit, marker: Sequence[int]) -> _Off | None:
     """Find markers (k,) that do not lie as they did; None if all do.
 
-    By all residuals, else by those that one tag leaves which moved by itself since the first look.
+    By all residuals, otherwise by the residuals of one tag that moved by itself since the first frame.
     """
     left, seen = _Left.of(rig, fit), fit.bundle.weight > 0.0
     dof = len(left.r) - left.J.shape[1]
     if dof < 1:
         return None
     r, square = left.after(np.zeros((len(left.r), 0)))
-    if square > (most := chdtri(dof, _BY_CHANCE)):
+    if square > (max_times := chdtri(dof, _BY_CHANCE)):
         off = np.zeros(seen.shape)
         off[seen] = (r.reshape(-1, 2) ** 2).sum(axis=1)
-        at_look = off.sum(axis=1)
-        look, k = np.unravel_index(int(np.argmax(at_look)), at_look.shape)
-        return _Off(float(np.sqrt(square / dof)), float(np.sqrt(most / dof)), int(look), (int(k),))
+        in_frame = off.sum(axis=1)
+        at_frame, k = np.unravel_index(int(np.argmax(in_frame)), in_frame.shape)
+        return _Off(float(np.sqrt(square / dof)), float(np.sqrt(max_times / dof)), int(at_frame), (int(k),))
     tags = _tags(marker)
     for tag in tags if len(tags) > 1 else ():
         by_tag = _by_motion(rig, fit, tag)[seen].reshape(len(left.r), -1)
         fell, g = square - left.after(by_tag)[1], by_tag.shape[1]
-        if fell > (most := chdtri(g, _SLIPPED / len(tags))):
-            return _Off(float(np.sqrt(fell / g)), float(np.sqrt(most / g)), len(fit.T) - 1, tag)
+        if fell > (max_times := chdtri(g, _SLIPPED / len(tags))):
+            return _Off(float(np.sqrt(fell / g)), float(np.sqrt(max_times / g)), len(fit.T) - 1, tag)
     return None
 
 
 def _tags(marker: Sequence[int]) -> list[tuple[int, ...]]:
-    """Positions of the corners of each tag among markers (k,), of those of which all are there."""
+    """Positions of the corners of each tag among markers (k,), of tags with all corners."""
     at = {number: k for k, number in enumerate(marker)}
     corners = {CORNERS * (number // CORNERS): None for number in marker}
     whole = [[first + k for k in range(CORNERS)] for first in corners]
@@ -266,7 +266,7 @@ def _tags(marker: Sequence[int]) -> list[tuple[int, ...]]:
 
 
 def _by_motion(rig: ObjectViewRig, fit: BundleFit, tag: Sequence[int]) -> FloatArray:
-    """Derivatives (L, V, k, 2, g) of images by displacements of some markers in the last look."""
+    """Derivatives (L, V, k, 2, g) of images by displacements of some markers in the last frame."""
     bundle, X, T = fit.bundle, fit.X[None], fit.T[None]
     own = bundle._replace(E=generators(rig.linear, fit.X[list(tag), :3].mean(axis=0)))
     moved: FloatArray = own.by_motion(bundle.residuals(X, T)[1], X, T)[0]
@@ -276,29 +276,29 @@ def _by_motion(rig: ObjectViewRig, fit: BundleFit, tag: Sequence[int]) -> FloatA
 
 
 def _of_one_object(
-    rig: ObjectViewRig, marker: Sequence[int], looks: Sequence[ObjectView]
+    rig: ObjectViewRig, marker: Sequence[int], frames: Sequence[ObjectView]
 ) -> tuple[BundleFit, BoolArray, tuple[int, ...]]:
     """The object as found in looks, its markers (k,) that are known, and numbers of those that were left out.
 
-    A marker that is off by itself in one look, as a finder errs at a covered edge, is left out of that look,
-    one of ``_SHARE`` seen at most. Raises WorkFailed where more are off: that is another object.
+    A single outlier in one frame, as a finder errs at a covered edge, is left out of that frame,
+    one of ``_SHARE`` seen at most. Raises WorkFailed if more err: that is another object.
     """
-    looks, left_out = list(looks), list[int]()
+    frames, left_out = list(frames), list[int]()
     while True:
-        fit, found_in, known = _Search(rig, marker, looks).found()
+        fit, found_in, known = _Search(rig, marker, frames).found()
         numbers = np.asarray(marker)[known]
         off = _elsewhere(rig, fit, numbers.tolist())
         if off is None:
             return fit, known, tuple(left_out)
-        look, which = found_in[off.look], numbers[list(off.markers)].tolist()
-        seen = np.isfinite(looks[look].s).all(axis=-1).any(axis=0)
+        at_frame, which = found_in[off.at_frame], numbers[list(off.markers)].tolist()
+        seen = np.isfinite(frames[at_frame].s).all(axis=-1).any(axis=0)
         if (len(which) + len(left_out)) * _SHARE > seen.sum():
             of = Subject(markers=tuple(which))
-            raise unknown(Finding("object_deformed", REFUSES, of, off.times, limit=off.most, unit="1"))
+            raise unknown(Finding("object_deformed", REFUSES, of, off.times, limit=off.max_times, unit="1"))
         left_out += which
-        s = looks[look].s.copy()
+        s = frames[at_frame].s.copy()
         s[:, np.isin(marker, which)] = np.nan
-        looks[look] = looks[look]._replace(s=s)
+        frames[at_frame] = frames[at_frame]._replace(s=s)
 
 
 def images_by_motion(c: Calibration, s: FloatArray) -> FloatArray:
@@ -363,7 +363,7 @@ class DisplacedObject:
     angle_deg: float  # turn; NaN if the joints do not determine the metric
     noise_factor: float  # residuals over their deviation, rms per degree of freedom
     unit_mm: float  # mm in a unit of the frame that it was found in; NaN without a known length
-    left_out: tuple[int, ...]  # numbers of markers that were off by themselves in a look, and left out of it
+    left_out: tuple[int, ...]  # numbers of markers that were outliers in a frame, and left out of it
     _rig: ObjectViewRig
     _fit: BundleFit
 
@@ -374,7 +374,7 @@ class DisplacedObject:
 
     @classmethod
     def of(
-        cls, c: Calibration, marker: Sequence[int], looks: Sequence[ObjectView], metric: Metric | None = None
+        cls, c: Calibration, marker: Sequence[int], frames: Sequence[ObjectView], metric: Metric | None = None
     ) -> Self:
         """Find the displacement of an object by all looks at it.
 
@@ -383,17 +383,17 @@ class DisplacedObject:
 
         c : calibration with its covariance.
         marker : (k,) numbers of the markers of the object, as messages name them.
-        looks : two or more, the first when the goal was taught, the last now; views as of the calibration.
+        frames : two or more, the first when the goal was taught, the last now; views as of the calibration.
         metric : of the calibration with a known length, for mm.
-        Raises InputError for cameras on the tool, and WorkFailed for what images or joints do not show, which
-        names the freedom that is missing.
+        Raises InputError for cameras on the tool, and WorkFailed for motions that images or joints do not
+        show, which names the freedom that is missing.
         """
         if c.mount == TOOL:
             raise InputError(
                 "objects: cameras on the tool see the scene that the goal is on: its own images are the goal"
             )
         rig = ObjectViewRig.of(c)
-        fit, known, left_out = _of_one_object(rig, marker, looks)
+        fit, known, left_out = _of_one_object(rig, marker, frames)
         numbers = tuple(np.asarray(marker)[known].tolist())
         T, back = fit.T[-1] @ np.linalg.inv(fit.T[0]), np.linalg.inv(rig.G)
         taught, now = fit.X @ fit.T[0].T, fit.X @ fit.T[-1].T
@@ -424,7 +424,7 @@ class DisplacedObject:
         )
 
     def carry(self, goal: ObjectView | FloatArray) -> _CarriedGoal:
-        """Carry a goal of the tool along that was taught at the first look.
+        """Carry a goal of the tool along that was taught in the first frame.
 
         goal : images (V, m, 2) of the markers of the tool there, px, in the order of the calibration; NaN
             where unseen.
@@ -447,8 +447,8 @@ class DisplacedObject:
             motion = out._replace(E=E).by_motion(by_point, points[None], T[None, None])
             return np.asarray(motion.reshape(s.size, -1))
 
-        held = tool.X @ (to_taught @ tool.T[0]).T
-        by_goal, by_now = by(tool.bundle.E, tool.X, H), by(fit.bundle.E, held, fit.T[-1])
+        carried = tool.X @ (to_taught @ tool.T[0]).T
+        by_goal, by_now = by(tool.bundle.E, tool.X, H), by(fit.bundle.E, carried, fit.T[-1])
         (xi, xi_c), (goal_s, goal_c) = self._errors(), tool.errors(rig, rig.M)
         of_calibration = changes_of(rig.pixels(rig.M @ H.T)).reshape(-1, s.size).T
         of_calibration += by_now @ xi_c + by_goal @ goal_c
@@ -456,10 +456,10 @@ class DisplacedObject:
         def images(T: FloatArray) -> FloatArray:
             """Images (K, V m 2) after small displacements (K, 4, 4) of the object."""
             exact = rig._replace(P=rig.P[:1], lens=rig.lens[:1])
-            return exact.pixels(held @ (fit.T[-1] @ T).swapaxes(1, 2)).reshape(len(T), -1)
+            return exact.pixels(carried @ (fit.T[-1] @ T).swapaxes(1, 2)).reshape(len(T), -1)
 
-        bent = _second_order(images, fit.bundle.E, np.hstack([xi, xi_c]))
-        changes = np.concatenate([by_now @ xi, by_goal @ goal_s, of_calibration, bent], axis=1)
+        second = _second_order(images, fit.bundle.E, np.hstack([xi, xi_c]))
+        changes = np.concatenate([by_now @ xi, by_goal @ goal_s, of_calibration, second], axis=1)
         pose = by(generators(rig.turns, placed[:, :3].mean(axis=0)), placed, np.eye(4))
         pose_changes = np.linalg.pinv(pose) @ changes
         return _CarriedGoal(
@@ -476,9 +476,9 @@ class DisplacedObject:
         fit = self._fit
         by_images, by_calibration = fit.errors(self._rig, fit.X)
         xi, xi_c = np.zeros((2, len(fit.bundle.E), 1))
-        for look, sign in ((0, -1.0), (len(fit.T) - 1, 1.0)):
-            if look != fit.bundle.fixed:
-                own = fit.bundle.columns(look, len(fit.X))
+        for at_frame, sign in ((0, -1.0), (len(fit.T) - 1, 1.0)):
+            if at_frame != fit.bundle.fixed:
+                own = fit.bundle.columns(at_frame, len(fit.X))
                 xi, xi_c = xi + sign * by_images[own], xi_c + sign * by_calibration[own]
         return xi, xi_c
 
@@ -486,9 +486,9 @@ class DisplacedObject:
 def _second_order(
     images: Callable[[FloatArray], FloatArray], E: FloatArray, errors: FloatArray
 ) -> FloatArray:
-    """Changes (N, c) of second order of images (N,), uncorrelated with each other and with those of first.
+    """Changes (N, c) of second order of images (N,), uncorrelated with each other and with first order.
 
-    The tool is beside the object, so a turn by an error takes it along an arc.
+    The tool is next to the object, so a turn by an error takes it along an arc.
     images : (K, N) of small displacements (K, 4, 4) by generators E (g, 4, 4); errors : (g, c) of it.
     """
     values, vectors = np.linalg.eigh(errors @ errors.T)
@@ -498,10 +498,10 @@ def _second_order(
     sums, gaps = (L[:, i] + L[:, j]).T, (L[:, i] - L[:, j]).T
     steps = np.stack([sums, -sums, gaps, -gaps])
     at = images(expm(np.einsum("...g,gij->...ij", steps, E)).reshape(-1, 4, 4))
-    bent = 0.25 * np.einsum("s,skn->nk", [1.0, 1.0, -1.0, -1.0], at.reshape(4, len(i), -1))
-    # Of unit variance are z_i z_j and (z_i² − 1)/√2; the mean of z_i² is 1.
-    mean = 0.5 * bent[:, i == j].sum(axis=1)
-    return np.column_stack([np.where(i == j, np.sqrt(0.5), 1.0) * bent, mean])
+    second = 0.25 * np.einsum("s,skn->nk", [1.0, 1.0, -1.0, -1.0], at.reshape(4, len(i), -1))
+    # Terms of unit variance are z_i z_j and (z_i² − 1)/√2; the mean of z_i² is 1.
+    mean = 0.5 * second[:, i == j].sum(axis=1)
+    return np.column_stack([np.where(i == j, np.sqrt(0.5), 1.0) * second, mean])
 
 
 def _unit_m(rig: ObjectViewRig, metric: Metric) -> float:
@@ -528,8 +528,8 @@ def _tool_at(rig: ObjectViewRig, goal: ObjectView) -> BundleFit:
     fit = BundleFit(bundle, M, T[:1], float(cost[0]))
     deviation, _ = fit.unseen(0)
     if deviation > _UNSEEN:
-        at_most = min(deviation, np.pi)
-        raise unknown(Finding("goal_turned", REFUSES, amount=at_most, limit=_UNSEEN, unit="rad"))
+        capped = min(deviation, np.pi)
+        raise unknown(Finding("goal_turned", REFUSES, amount=capped, limit=_UNSEEN, unit="rad"))
     if len(cost) > 1 and cost[1] - cost[0] < _UNDECIDED:
         apart = float(cost[1] - cost[0])
         raise unknown(Finding("goal_in_two_poses", REFUSES, amount=apart, limit=_UNDECIDED))

@@ -44,7 +44,7 @@ MISFIT_GOAL = 9
 NOT_MEASURED = 10
 _SIDES = (
     "the {} camera sees one side of the face at the start and the other at the goal, by the order of its "
-    "markers: move the goal, or else the start, to where that camera sees the printed side"
+    "markers: move the goal, or the start, to where that camera sees the printed side"
 )
 _UNSEEN = (
     "the images at the {} show {{}} markers in all views together, too few to locate the body: show three "
@@ -78,8 +78,8 @@ class Task(NamedTuple):
     pair: IntArray  # (2,) views from which the face is triangulated; none of one view
     F: FloatArray  # (3, 3) fundamental matrix of the pair
     O: FloatArray  # (V, 4) optical centres, a_inf·O = 1
-    visible: FloatArray  # (V,) sign of a·O on the visible side of the face, one a camera
-    least_views: int  # number of views that are to see the face
+    visible: FloatArray  # (V,) sign of a·O on the visible side of the face, one per camera
+    min_views: int  # number of views that are to see the face
     body: Body = NO_BODY  # all markers of the body, to measure the face with; none for point by point
     reference: Reference = NO_REFERENCE  # plan to follow; none to regulate to the goal
     incidences: Incidences = NO_INCIDENCES  # that are to hold at the goal; none for the pose
@@ -211,26 +211,26 @@ def task_into(
 def sides_into(task: Task, A: FloatArray, s: FloatArray) -> tuple[int, int]:
     """Record the side of the face A (m, 4) that each camera sees at the start, by its images s (V, ≥m, 2).
 
-    A camera that shows none of it is told by one that does. Returns a code if more cameras than may be left
-    out see another side at the goal, and the first of them.
+    The side of a camera that shows none of it follows from another one. Returns a code if more cameras than
+    may be left out see another side at the goal, and the first of them.
     """
     a = face_plane(A, task.order, center_of(A, task.center))
     a_star = face_plane(task.A_star, task.order, center_of(task.A_star, task.center))
     V = task.O.shape[0]
-    shown = 0.0
+    side = 0.0
     for view in range(V - 1, -1, -1):
         if _shows(s, view, A.shape[0]):
-            shown = 1.0 if dot(vec(task.O[view]), a) > 0.0 else -1.0
+            side = 1.0 if dot(vec(task.O[view]), a) > 0.0 else -1.0
     count, first = V, -1
     for view in range(V):
         O = vec(task.O[view])
         task.visible[view] = 1.0 if dot(O, a) > 0.0 else -1.0
-        if shown != 0.0 and not _shows(s, view, A.shape[0]):
-            task.visible[view] = shown
+        if side != 0.0 and not _shows(s, view, A.shape[0]):
+            task.visible[view] = side
         if task.visible[view] * dot(O, a_star) <= 0.0:
             count -= 1
             first = view if first < 0 else first
-    return (FOUND, 0) if count >= task.least_views else (_OTHER_SIDE, first)
+    return (FOUND, 0) if count >= task.min_views else (_OTHER_SIDE, first)
 
 
 @inline
@@ -249,12 +249,12 @@ def require_found(status: int, detail: int, view: Sequence[str] = VIEWS) -> None
 
 
 def new_task(
-    model: Model, s_star: FloatArray, center: int, pair: IntArray | None = None, least_views: int = 0
+    model: Model, s_star: FloatArray, center: int, pair: IntArray | None = None, min_views: int = 0
 ) -> Task:
     """Task with pixels (V, m, 2) of the face at the goal, without target points yet.
 
     pair : (2,) views from which the face is triangulated, (0,) for none; None for the only two.
-    least_views : that are to see the face, 0 for all.
+    min_views : that are to see the face, 0 for all.
     Raises WorkFailed if there are fewer than three markers, or both cameras have the same centre.
     """
     m, pair = s_star.shape[1], np.arange(2) if pair is None else pair
@@ -268,5 +268,5 @@ def new_task(
         F=fundamental_matrix(model.P[pair]) if len(pair) else np.zeros((3, 3)),
         O=optical_centers(model.P, model.a_inf),
         visible=np.zeros(len(model.P)),
-        least_views=least_views or len(model.P),
+        min_views=min_views or len(model.P),
     )

@@ -1,7 +1,7 @@
-"""How far features are from where incidences want them, and how far that may be off, in mm and degrees.
+"""Distances of features from their incidences, with deviations, in mm and degrees.
 
-Errors are those of the images of both poses and of the calibration, to first order; where the calibration is
-off, both poses and all features are off alike, and what they have in common drops out.
+Errors come from the images of both poses and from the calibration, to first order; if the calibration is
+wrong, both poses and all features err alike, and their common error drops out.
 """
 
 from collections.abc import Sequence
@@ -75,7 +75,7 @@ def _axis(points: FloatArray) -> FloatArray:
 
 
 def angle_off(one: Incidence, tool: FloatArray, scene: FloatArray) -> float:
-    """Angle, rad, by which features spanned by points (k, 3) are off; in their sense if both are alike."""
+    """Angle, rad, by which features spanned by points (k, 3) deviate; in their sense if both are alike."""
     cosine = float(np.clip(_axis(tool) @ _axis(scene), -1.0, 1.0))
     between = np.arccos(cosine) if len(tool) == len(scene) else abs(np.arcsin(cosine))
     return float(abs(between - _wanted(one)))
@@ -96,7 +96,7 @@ class TaughtAndNow(NamedTuple):
 class IncidenceErrors(NamedTuple):
     """Errors of incidences (g,), and their deviations; NaN if undefined or unknown."""
 
-    mm: FloatArray  # of the point that is off most, as images show it
+    mm: FloatArray  # distance of the farthest point, as images show it
     deg: FloatArray
     deviation_mm: FloatArray
     deviation_deg: FloatArray
@@ -105,12 +105,12 @@ class IncidenceErrors(NamedTuple):
 class Placed(NamedTuple):
     """A body where the goal was taught and where it is, in the metric frame of the arm."""
 
-    M: FloatArray  # (B, k, 4) markers at the reference, as calibrated and off by its errors
+    M: FloatArray  # (B, k, 4) markers at the reference, as calibrated and changed by its errors
     T: FloatArray  # (2, 4, 4) displacements
     E: FloatArray  # (6, 4, 4) generators of steps of them
-    unit_mm: FloatArray  # (B,) mm in a unit; 1 where no length is known
+    unit_mm: FloatArray  # (B,) mm in a unit; 1 if no length is known
     errors: tuple[FloatArray, FloatArray]  # (6, ...) of each displacement, by independent errors
-    of_object: UncertainPoints  # markers where they are, whose positions come after those of the body
+    of_object: UncertainPoints  # markers where they are, whose positions come after the body's
 
     def on_object(self, one: Incidence) -> bool:
         """Whether the feature of the scene is of the markers of the object, and none that was taught."""
@@ -123,7 +123,7 @@ class Placed(NamedTuple):
         T: FloatArray | None = None,
         X: FloatArray | None = None,
     ) -> tuple[FloatArray, FloatArray]:
-        """Points (..., l, 3) that span the feature of the tool, and that of the scene.
+        """Points (..., l, 3) that span the feature of the tool, and the feature of the scene.
 
         Of markers M (..., k, 4) at T (..., 2, 4, 4), and X (..., o, 4) of the object; as found if not given.
         """
@@ -171,7 +171,7 @@ class Placed(NamedTuple):
 
 @lru_cache(maxsize=8)
 def metric_rig(c: Calibration) -> ObjectViewRig | None:
-    """Cameras and tool in the metric of the arm; None where the joints leave it open."""
+    """Cameras and tool in the metric of the arm; None if the joints leave it open."""
     try:
         rig = ObjectViewRig.of(c)
     except WorkFailed:
@@ -199,7 +199,7 @@ def incidence_errors(
     ends: TaughtAndNow,
     lengths: FloatArray,
 ) -> IncidenceErrors:
-    """State how far features are from where incidences want them; NaN where the joints leave the metric open.
+    """State how far features are from where incidences want them; NaN if the joints leave the metric open.
 
     markers : (k,) indices of the markers of the body, of which the face comes first.
     asked : incidences by positions in the body.

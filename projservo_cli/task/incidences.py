@@ -1,4 +1,4 @@
-"""Tasks as lists of incidences: points, lines and planes of the tool that lie on those of the scene.
+"""Tasks as lists of incidences: points, lines and planes of the tool that lie on features of the scene.
 
 Everything is made of a point A and a plane b, a_inf·A = 1: e = bᵀA, with the row [bᵀĤ_1 A, ..., bᵀĤ_n A] of
 the interaction. Points at infinity are directions, and make lines and planes parallel; with the metric form
@@ -6,10 +6,10 @@ that the joints preserve, perpendicular or inclined. The joint motion of J⁺e d
 of planes or projective frame where J has full row rank.
 
 Errors e have no unit. They are weighted by the images of the body at the goal, so that their norm is the
-least motion of its images that meets them; for a pose of six rows it is the image error itself.
+minimum motion of its images that meets them; for a pose of six rows it is the image error itself.
 
 Source: J. Hespanha, Z. Dodds, G. Hager, A. Morse, "What tasks can be performed with an uncalibrated stereo
-vision system?", International Journal of Computer Vision 35, 1999, for what can be decided.
+vision system?", International Journal of Computer Vision 35, 1999, for the tasks that can be decided.
 """
 
 import math
@@ -47,9 +47,9 @@ _FREE = 1e-6
 # Newton steps to a displacement at which all incidences hold: how many, the largest turn of one, rad, and the
 # last, over unit motions; singular value over the largest that counts as zero.
 _STEPS, _STRIDE, _SETTLED, _SINGULAR = 50, 0.5, 1e-12, 1e-9
-# Error, over what a unit motion of the body changes, at which a row is met: of round-off.
+# Error, over the change by a unit motion of the body, at which a row is met: of round-off.
 _MET = 1e-6
-# Error over what a unit of the measured motion changes, from which no motion lowers it, and the turn, rad,
+# Error, over the change by a unit of the measured motion, from which no motion lowers it, and the turn, rad,
 # that leads away from there.
 _FAR, _NUDGE = 1e6, 0.1
 
@@ -67,7 +67,7 @@ class Incidence(NamedTuple):
     scene: Flat  # the feature of the tool that was there when the goal was taught, or of the object itself
     relation: str = MEET
     angle_deg: float = math.nan  # between both, for ``ANGLE``
-    carrier: int = 0  # of the feature of the scene, by places of the goal: the scene, then objects
+    carrier: int = 0  # carrier of the feature of the scene, by places of the goal: the scene, then objects
 
     def visible_by(self, markers: Collection[int]) -> bool:
         """Whether the feature of the scene is where one of the tool was, which has these markers."""
@@ -86,11 +86,11 @@ class Incidences(NamedTuple):
     # these alone near the goal
     rows: FloatArray
     # (g, 11) direction or plane of the tool at the reference, the direction of the scene, or across its
-    # plane, to which that of the tool is to point, 1 for planes, the number of the incidence, and the error
-    # of half a turn, px
+    # plane, to which the direction of the tool is to point, 1 for planes, the number of the incidence, and
+    # the error of half a turn, px
     senses: FloatArray
     # (6 + V + d,) plane a of the face at the reference, number of markers of the body at the goal, once a
-    # view, w, a·O of each view there, in the frame of the body, and what is left of each other error, px
+    # view, w, a·O of each view there, in the frame of the body, and the residual of each other error, px
     sight: FloatArray
 
     @property
@@ -113,7 +113,7 @@ class Incidences(NamedTuple):
 
 # Columns of the rows: of the tool, then of the scene, and these.
 _SCENE, _SENSE, _OFFSET, _GROUP, _WEIGHT = 4, 8, 9, 10, 11
-# Columns of the senses after those of the tool and the scene, and entries of the sight after the plane.
+# Columns of the senses after the senses of the tool and the scene, and entries of the sight after the plane.
 _IS_PLANE, _OF, _TURN_PX = 8, 9, 10
 _VIEWS_USED, _RANK, SHOWN = 4, 5, 6
 NO_INCIDENCES = Incidences(rows=np.zeros((0, _WEIGHT)), senses=np.zeros((0, 11)), sight=np.zeros(SHOWN))
@@ -152,7 +152,7 @@ def points_away(sense: FloatArray, H: Mat4, H_back: Mat4) -> bool:
 
 @merged
 def turn_rate(sense: FloatArray, H: Mat4, H_back: Mat4, H_hat: Mat4) -> float:
-    """Derivative by the amplitude of an operator Ĥ of the body at H of what is positive in its sense."""
+    """Derivative, by the amplitude of an operator Ĥ of the body at H, of its signed value."""
     to = vec(sense[_SCENE:])
     if sense[_IS_PLANE] > 0.0:
         return -dot(apply_transposed(H_hat, apply_transposed(H_back, vec(sense))), to)
@@ -240,7 +240,7 @@ def whole_pose(A: FloatArray) -> tuple[Incidence, ...]:
 class JointMetric:
     """Directions and normals in the metric that the joints preserve; S takes points to metric ones.
 
-    name : what needs it, for messages.
+    name : feature that needs it, for messages.
     """
 
     def __init__(self, model: Model, name: str) -> None:
@@ -260,7 +260,7 @@ class JointMetric:
         return self.unit(self._back @ np.append((plane @ self._back)[:3], 0.0))
 
     def along(self, D: FloatArray) -> FloatArray:
-        """Plane (4,) whose product with a direction is that of both directions."""
+        """Plane (4,) whose product with a direction is the product of both directions."""
         return np.asarray(self._S[:3].T @ (self._S[:3] @ D))
 
 
@@ -271,17 +271,17 @@ def plane_through(points: FloatArray) -> FloatArray:
 
 
 def _directions(points: FloatArray) -> FloatArray:
-    """Directions (k − 1, 4) that span those of a line or plane through points (k, 4)."""
+    """Directions (k − 1, 4) that span the directions of a line or plane through points (k, 4)."""
     return np.asarray(points[1:] - points[0])
 
 
-_Row = tuple[FloatArray, FloatArray, float, float]  # of the tool, of the scene, sense, offset
+_Row = tuple[FloatArray, FloatArray, float, float]  # feature of the tool, of the scene, sense, offset
 
 
 def _incident(tool: FloatArray, scene: FloatArray, dual_of: FloatArray, own_dual: FloatArray) -> list[_Row]:
     """Rows that put the points (k, 4) of the smaller feature on the planes that hold the other.
 
-    dual_of, own_dual : points that span the feature of the scene and that of the tool.
+    dual_of, own_dual : points that span the feature of the scene and the feature of the tool.
     """
     if len(tool) <= len(scene):
         return [(A, b, 1.0, 0.0) for A in tool for b in null_space(dual_of).T]
@@ -309,7 +309,7 @@ def _rows(one: Incidence, model: Model, tool: FloatArray, scene: FloatArray) -> 
 
 
 def _across(model: Model, body: Body, plane: FloatArray) -> FloatArray:
-    """Direction (4,) to the positive side of a plane (4,), its normal where the joints preserve a metric."""
+    """Direction (4,) to the positive side of a plane (4,), its normal if the joints preserve a metric."""
     try:
         return JointMetric(model, "a sense").normal(plane)
     except InputError:
@@ -354,7 +354,7 @@ def incidences_of(
 
 
 def _unweighted(incidences: Incidences) -> Incidences:
-    """Return the rows with errors of their own scale."""
+    """Return the rows with errors in their own scale."""
     return incidences.weighing(np.eye(len(incidences.rows)))
 
 
@@ -380,7 +380,7 @@ def weighted(
 
     H : (4, 4) displacement of the body at the goal; shows : (V, m) markers that images show there.
     a : (4,) plane of the face at the reference.
-    Raises WorkFailed where the images do not determine the body, or no incidence changes with its motion.
+    Raises WorkFailed if the images do not determine the body, or no incidence changes with its motion.
     """
     motions = _motions(body, H)
     J = image_velocities(model, shows)(body.M @ H.T, motions)
@@ -395,8 +395,8 @@ def weighted(
     rows[:, _SCENE:_SENSE] /= sigma[:, None]
     rows[:, _OFFSET] /= sigma
     senses[:, _TURN_PX] = [_turn_px(sense, H, motions[3:], J[:, 3:]) for sense in senses]
-    shown = O @ np.linalg.inv(H).T @ a
-    sight = np.array([*a, shows.sum(), 0.0, *shown], dtype=np.float64)
+    view_signs = O @ np.linalg.inv(H).T @ a
+    sight = np.array([*a, shows.sum(), 0.0, *view_signs], dtype=np.float64)
     weight, rest = _independent(half / sigma[:, None])
     found = Incidences(rows, senses, sight).weighing(weight)
     left = rest @ linearized(_unweighted(found), H, motions)[0]
@@ -407,7 +407,7 @@ def weighted(
 
 
 def _independent(half: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Weights (w, r) that make independent errors of unit variance of those of rows, and the rest (r − w, r).
+    """Weights (w, r) that turn errors of rows into independent unit ones, and the rest (r − w, r).
 
     half : (r, p) errors by independent ones, each of unit variance.
     """
@@ -432,8 +432,8 @@ def _turn_px(sense: FloatArray, H: FloatArray, turns: FloatArray, J: FloatArray)
 def nearest_goal(incidences: Incidences, body: Body, H: FloatArray, moved: _Moved) -> FloatArray:
     """Displacement (4, 4) near H at which all incidences hold in their senses, by Gauss and Newton.
 
-    moved : measures motions of the body; each step is the least of those that meet the incidences.
-    Where that ends with a feature turned over, or off, the nearest of the places is taken that steps from H,
+    moved : measures motions of the body; each step is the shortest that meets the incidences.
+    If that ends with a feature turned over, or off, the nearest of the places is taken that steps from H,
     turned to all sides, lead to. Incidences that contradict each other leave an error, as of ``image_error``.
     """
     found = _stepped_to(incidences, body, H, moved)
@@ -444,7 +444,8 @@ def nearest_goal(incidences: Incidences, body: Body, H: FloatArray, moved: _Move
     met = [one for one in others if _is_met(incidences, body, one)]
     if not met:
         return found
-    return max(met, key=lambda one: float(np.trace(body.D @ np.linalg.inv(H) @ one @ body.D.T)))  # least turn
+    # smallest turn
+    return max(met, key=lambda one: float(np.trace(body.D @ np.linalg.inv(H) @ one @ body.D.T)))
 
 
 def _is_met(incidences: Incidences, body: Body, H: FloatArray) -> bool:
@@ -455,7 +456,7 @@ def _is_met(incidences: Incidences, body: Body, H: FloatArray) -> bool:
 
 
 def _stepped_to(incidences: Incidences, body: Body, H: FloatArray, moved: _Moved) -> FloatArray:
-    """Displacement (4, 4) to which the least steps from H lead that meet all incidences."""
+    """Displacement (4, 4) that the shortest steps from H reach and that meets all incidences."""
     rows = incidences if rank_of(incidences) else _unweighted(incidences)
     for _ in range(_STEPS):
         motions = _motions(body, H)
@@ -487,10 +488,10 @@ def each_in_pixels(
 
 
 def min_errors(incidences: Incidences, body: Body, H: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Displacements (s, 4, 4) beside some at which all rows together err least, and their squares (s,), px².
+    """Displacements (s, 4, 4) near given ones of minimum error of all rows, and its squares (s,), px².
 
     incidences : each row by itself; one that depends on others counts. H : (s, 4, 4). The square of a feature
-    that points the other way is that of half a turn.
+    that points the other way is half a turn.
     """
 
     def equations(H: FloatArray) -> Equations:
@@ -510,7 +511,7 @@ def min_errors(incidences: Incidences, body: Body, H: FloatArray) -> tuple[Float
 
 
 def _turned_px(incidences: Incidences, H: FloatArray) -> FloatArray:
-    """Errors (g,) of senses at H (4, 4): half a turn where a feature points the other way, else zero, px."""
+    """Errors (g,) of senses at H (4, 4): half a turn if a feature points the other way, or zero, px."""
     return np.where(_away_at(incidences, H), incidences.senses[:, _TURN_PX], 0.0)
 
 
@@ -533,7 +534,7 @@ def image_error_at(incidences: Incidences, H: FloatArray) -> float:
 def errors_px(incidences: Incidences, H: FloatArray) -> FloatArray:
     """Error (k, g) of each incidence at displacements H (k, 4, 4) over its deviation at one pixel of noise.
 
-    The root of the mean square over its independent rows, and half a turn where it points the other way, px;
+    The root of the mean square over its independent rows, and half a turn if it points the other way, px;
     NaN where a displacement is.
     """
     half, group, own = np.linalg.pinv(incidences.weight), incidences.rows[:, _GROUP], list[Incidences]()

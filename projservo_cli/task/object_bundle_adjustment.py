@@ -59,7 +59,7 @@ class ObjectView(NamedTuple):
 
 
 class ObjectViewRig(NamedTuple):
-    """Cameras and tool, as calibrated and off by its errors, with the plane at infinity (0, 0, 0, 1).
+    """Cameras and tool, as calibrated and changed by its errors, with the plane at infinity (0, 0, 0, 1).
 
     Displacements are rigid there, if the joints determine the metric.
     """
@@ -100,10 +100,10 @@ class ObjectViewRig(NamedTuple):
         """Whether displacements are rigid."""
         return len(self.linear) == len(self.turns)
 
-    def bundle(self, looks: Sequence[ObjectView], E: FloatArray, fixed: int = -1) -> "Bundle":
+    def bundle(self, frames: Sequence[ObjectView], E: FloatArray, fixed: int = -1) -> "Bundle":
         """Least squares of some looks; arguments as of ``Bundle``."""
-        s = np.stack([np.asarray(look.s, dtype=np.float64) for look in looks])
-        sigma = np.stack([np.full(s.shape[1:3], np.nan) if x.sigma is None else x.sigma for x in looks])
+        s = np.stack([np.asarray(frame_index.s, dtype=np.float64) for frame_index in frames])
+        sigma = np.stack([np.full(s.shape[1:3], np.nan) if x.sigma is None else x.sigma for x in frames])
         sigma = np.where(np.isfinite(sigma) & (sigma > 0.0), sigma, self.sigma_px)
         weight = np.where(np.isfinite(s).all(axis=-1), 1.0 / sigma, 0.0)
         return Bundle(self.P[0], self.lens[0], s, weight, E, fixed)
@@ -148,7 +148,7 @@ class Bundle(NamedTuple):
     @property
     def moving(self) -> list[int]:
         """Looks with an unknown displacement."""
-        return [look for look in range(len(self.s)) if look != self.fixed]
+        return [frame_index for frame_index in range(len(self.s)) if frame_index != self.fixed]
 
     def residuals(self, X: FloatArray, T: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Residuals (B, N) over their deviation, and derivatives (B, L, V, k, 2, 4) of pixels by points.
@@ -165,10 +165,10 @@ class Bundle(NamedTuple):
         r = np.where(weight > 0.0, weight * (self.s - pixels), 0.0)
         return r.reshape(len(X), -1), weight[..., None] * by
 
-    def columns(self, look: int, k: int) -> slice:
-        """Columns of the displacement of a look among those of k points."""
+    def columns(self, frame_index: int, k: int) -> slice:
+        """Columns of the displacement of a frame among the columns of k points."""
         g = len(self.E)
-        first = (3 * k if self.free else 0) + g * self.moving.index(look)
+        first = (3 * k if self.free else 0) + g * self.moving.index(frame_index)
         return slice(first, first + g)
 
     def by_motion(self, by_point: FloatArray, X: FloatArray, T: FloatArray) -> FloatArray:
@@ -186,8 +186,8 @@ class Bundle(NamedTuple):
         by_X = by_point @ T[:, :, None, None, :, :3]
         for i in range(k):
             J[..., i, :, 3 * i : 3 * i + 3] = by_X[..., i, :, :]
-        for look in self.moving:
-            J[:, look, ..., self.columns(look, X.shape[1])] = by_motion[:, look]
+        for frame_index in self.moving:
+            J[:, frame_index, ..., self.columns(frame_index, X.shape[1])] = by_motion[:, frame_index]
         return r, J.reshape(len(X), r.shape[1], -1)
 
     def moved(self, X: FloatArray, T: FloatArray, step: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -216,7 +216,7 @@ class Bundle(NamedTuple):
         return X, T, there.cost
 
     def poses(self, X: FloatArray, turns: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Displacements (h, 4, 4) of known points X (k, 4) in one look, and χ² (h,): minima, least first.
+        """Displacements (h, 4, 4) of known points X (k, 4) in one frame, and χ² (h,): minima, sorted.
 
         turns : (3, 3, 3) rotations that the search starts from.
         """
@@ -272,27 +272,29 @@ class BundleFit:
 
     @classmethod
     def settled(cls, bundle: Bundle, X: FloatArray, T: FloatArray) -> Self:
-        """The minimum beside points (k, 4) and displacements (L, 4, 4)."""
+        """The minimum near points (k, 4) and displacements (L, 4, 4)."""
         X, T, cost = bundle.settled(X[None], T[None])
         return cls(bundle, X[0], T[0], float(cost[0]))
 
     def linearized(self) -> tuple[FloatArray, FloatArray]:
-        """Residuals (N,) and derivatives (N, p) of what is seen, over their deviation."""
+        """Residuals (N,) and derivatives (N, p) of visible markers, over their deviation."""
         r, J = self.bundle.linearized(self.X[None], self.T[None])
         seen = np.repeat(self.bundle.weight > 0.0, 2)
         return r[0, seen], J[0, seen]
 
     def moved(self, rig: ObjectViewRig, X: FloatArray) -> FloatArray:
-        """Changes (N, c) of what is seen by the errors of a calibration; X : (k, 4) or (B, k, 4) points."""
-        weight, looks = self.bundle.weight[..., None], range(len(self.T))
-        pixels = np.stack([changes_of(rig.pixels(X @ self.T[look].T)) for look in looks], axis=1)
+        """Changes (N, c) of visible markers by errors of a calibration; X : (k, 4) or (B, k, 4) points."""
+        weight, frames = self.bundle.weight[..., None], range(len(self.T))
+        pixels = np.stack(
+            [changes_of(rig.pixels(X @ self.T[frame_index].T)) for frame_index in frames], axis=1
+        )
         return (weight * pixels)[:, self.bundle.weight > 0.0].reshape(len(pixels), -1).T
 
     @cached_property
     def inverse_hessian(self) -> FloatArray:
-        """Inverse (p, p) of the second derivatives of χ²/2, with those of the images.
+        """Inverse (p, p) of the second derivatives of χ²/2, with the derivatives of the images.
 
-        What noise has bent looks better determined than it is: the residuals tell.
+        Noise in the points makes them look better determined than they are: the residuals correct that.
         """
         size = np.maximum(np.linalg.norm(self.linearized()[1], axis=0), 1e-300)
         p = len(size)
@@ -302,7 +304,7 @@ class BundleFit:
         up, down = np.split(-(J.swapaxes(1, 2) @ r[..., None])[..., 0] / size, 2)
         H = (up - down) / (2.0 * _PROBE)
         values, vectors = np.linalg.eigh(0.5 * (H + H.T))
-        # What is not seen at all gets a large deviation instead of an infinite one.
+        # An unseen marker gets a large deviation instead of an infinite one.
         root = vectors / np.sqrt(np.maximum(values, _REGULAR)) / size[:, None]
         return np.asarray(root @ root.T)
 
@@ -314,20 +316,20 @@ class BundleFit:
         by_images = self.inverse_hessian @ self.linearized()[1].T
         return by_images, -by_images @ self.moved(rig, X)
 
-    def points_at(self, look: int, rig: ObjectViewRig) -> "UncertainPoints":
-        """Return the points at a look, with their errors."""
-        T, (k, p) = self.T[look], (len(self.X), self.linearized()[1].shape[1])
+    def points_at(self, frame_index: int, rig: ObjectViewRig) -> "UncertainPoints":
+        """Return the points in a frame, with their errors."""
+        T, (k, p) = self.T[frame_index], (len(self.X), self.linearized()[1].shape[1])
         J = np.zeros((k, 3, p))
         for i in range(k if self.bundle.free else 0):
             J[i, :, 3 * i : 3 * i + 3] = T[:3, :3]
-        if look != self.bundle.fixed:
+        if frame_index != self.bundle.fixed:
             velocity = np.einsum("ij,gjm,km->kig", T, self.bundle.E, self.X)
-            J[..., self.bundle.columns(look, k)] = velocity[:, :3]
+            J[..., self.bundle.columns(frame_index, k)] = velocity[:, :3]
         by_images, by_calibration = (J @ errors for errors in self.errors(rig, self.X))
         return UncertainPoints(self.X @ T.T, by_images, by_calibration)
 
-    def unseen(self, look: int) -> tuple[float, FloatArray]:
+    def unseen(self, frame_index: int) -> tuple[float, FloatArray]:
         """Largest deviation of the linear part of a displacement by the noise, and its direction."""
-        own = self.bundle.columns(look, len(self.X))
+        own = self.bundle.columns(frame_index, len(self.X))
         values, vectors = np.linalg.eigh(self.inverse_hessian[own, own][3:, 3:])
         return float(np.sqrt(values[-1])), vectors[:, -1]

@@ -231,7 +231,7 @@ def _within_plane_part(
         velocity = scale(-1.0, velocity)
     a_i = meet(A_er, A_c, A_c2)
     second = apply(H_p2, A_e)
-    # In the sense of the operator a_iᵀ A_e grows where A_e passes its target, and falls beyond the axis: of
+    # Along the operator, a_iᵀ A_e grows where A_e passes its target, and falls beyond the axis: of
     # both solutions θ⁻ grows.
     unique, _, theta = incidence_angles(
         dot(a_i, A_e) + dot(a_i, second), dot(a_i, velocity), -dot(a_i, second)

@@ -16,18 +16,18 @@ from projservo_cli.records import BoolArray, FloatArray, InputError, Model, Work
 from projservo_cli.task.body_pose import Body
 from projservo_cli.task.incidences import Flat, JointMetric, plane_through, points_of
 
-# Doublings of the way in search of one that moves images far enough, from this share of the first.
+# Doublings of the distance in search of one that moves images far enough, from this share of the first.
 _DOUBLINGS, _FIRST = 30, 1e-3
 
 
 class StandOff(NamedTuple):
     """A displacement back along a line, or from a plane to the side that the first camera sees."""
 
-    name: str  # of the feature, as messages write it
+    name: str  # name of the feature, as in messages
     along: Flat  # points that span it, by numbers of markers or by their positions in the body
     by_m: float | None  # length; below 0 the other way
     by_px: float | None  # mean motion of the images in the view in which they move most
-    of_start: bool = False  # whether it is that of the start instead of the goal
+    of_start: bool = False  # whether it displaces the start instead of the goal
 
     @property
     def words(self) -> str:
@@ -55,7 +55,7 @@ def displacement_back(
 
     asked : with positions in the body; shows : (V, m) markers whose motion in the images counts.
     metre : metres a unit of the metric that the joints preserve; NaN if unknown.
-    Raises InputError where a length or a normal is asked for and unknown, WorkFailed where images never move
+    Raises InputError if a required length or normal is unknown, WorkFailed where images never move
     so far.
     """
     D = _direction_back(model, body, H, asked)
@@ -87,5 +87,7 @@ def displacement_back(
             break
         s *= 2.0
     if not 0.0 <= moved_px(s) < np.inf or moved_px(0.0) >= 0.0:
-        raise WorkFailed(f"displaced: no way along {asked.name} moves the images by {abs(asked.by_px):g} px")
+        raise WorkFailed(
+            f"displaced: no distance along {asked.name} moves the images by {abs(asked.by_px):g} px"
+        )
     return np.asarray(np.eye(4) + brentq(moved_px, 0.0, s, xtol=1e-14 * s) * np.outer(D, model.a_inf))

@@ -67,11 +67,11 @@ class Place(NamedTuple):
 
 
 class TargetGoal(NamedTuple):
-    """What is to hold at the end: incidences, each where its carrier has it, or the whole pose."""
+    """Goal of a task: incidences, each at its carrier, or the whole pose."""
 
-    places: tuple[Place, ...]  # of the scene, then of objects that were looked at
+    locations: tuple[Place, ...]  # places of the scene, then of observed objects
     s: FloatArray  # (V, b, 2) px at the pose to drive to: of incidences the one that was chosen
-    incidences: tuple[Incidence, ...] = ()  # by positions in the body; none for the whole pose
+    incidences: tuple[Incidence, ...] = ()  # incidences by positions in the body; none for the whole pose
 
     @classmethod
     def at(cls, s: FloatArray) -> "TargetGoal":
@@ -81,20 +81,20 @@ class TargetGoal(NamedTuple):
     @property
     def carriers(self) -> tuple[int, ...]:
         """Places of the carriers of its incidences, each once; of a whole pose the last one."""
-        return tuple(sorted({one.carrier for one in self.incidences})) or (len(self.places) - 1,)
+        return tuple(sorted({one.carrier for one in self.incidences})) or (len(self.locations) - 1,)
 
     def place(self, carrier: int) -> Place:
         """Place of a carrier; of an object that was not looked at where the goal was taught."""
-        return self.places[carrier if carrier < len(self.places) else 0]
+        return self.locations[carrier if carrier < len(self.locations) else 0]
 
     def carried_to(self, objects: Sequence[Place]) -> "TargetGoal":
         """Return the goal with its objects where they are now; all of it goes along, unless that tears it."""
-        found = self._replace(places=(self.places[0], *objects))
+        found = self._replace(locations=(self.locations[0], *objects))
         return found if len(found.carriers) > 1 else found._replace(s=found.place(*found.carriers).s)
 
     def to(self, s: FloatArray) -> "TargetGoal":
-        """Return the goal where images (V, b, 2) show it, whatever carries it."""
-        return self._replace(places=tuple(place._replace(s=s) for place in self.places), s=s)
+        """Return the goal where images (V, b, 2) show it, for any carrier."""
+        return self._replace(locations=tuple(place._replace(s=s) for place in self.locations), s=s)
 
 
 class TaskImages(NamedTuple):
@@ -105,10 +105,10 @@ class TaskImages(NamedTuple):
     goal: TargetGoal
     center: int  # index of the centre marker within the face, or ``MIDPOINT``
     pins: int = 0  # number of markers that are not on the face
-    body: Body = NO_BODY  # of all markers, to measure with; none to measure point by point
+    body: Body = NO_BODY  # body of all markers, to measure with; none to measure point by point
     view: tuple[str, ...] = VIEWS  # names of the views
-    least_views: int = 0  # number of views that are to see the face, 0 for all
-    # (n,) joints near those of the goal, rad or m, which predict its pose where no pair of views shows it
+    min_views: int = 0  # number of views that are to see the face, 0 for all
+    # (n,) joints near the goal joints, rad or m, which predict its pose if no pair of views shows it
     q_near: FloatArray = np.zeros(0)
 
     @property
@@ -128,10 +128,10 @@ class TaskImages(NamedTuple):
     def pair(self) -> IntArray:
         """Views (2,) that show the whole face at start and goal, the first ones; none without two."""
         m = self.s_start.shape[1] - self.pins
-        shown = np.isfinite([self.s_start[:, :m], self.s_star[:, :m]]).all(axis=(0, 2, 3))
+        enough = np.isfinite([self.s_start[:, :m], self.s_star[:, :m]]).all(axis=(0, 2, 3))
         if is_stereo(self.view):
             return np.arange(len(self.view))
-        return np.flatnonzero(shown)[:2] if shown.sum() > 1 else np.arange(0)
+        return np.flatnonzero(enough)[:2] if enough.sum() > 1 else np.arange(0)
 
     def by_points(self) -> "TaskImages":
         """Select the markers of the face, to measure it point by point; incidences need the body."""
@@ -173,7 +173,7 @@ class TaskImages(NamedTuple):
         for one, H in zip(self.goal.incidences, H_taught, strict=True):
             M = np.concatenate([self.body.M, self.goal.place(one.carrier).M])
             if not one.visible_by(range(len(M))):
-                raise WorkFailed(f"incidence {one.name}: nobody has looked where its object is: plan first")
+                raise WorkFailed(f"incidence {one.name}: its object was not located: plan first")
             found.append(points_of(M, one.scene) @ H.T)
         return found
 
@@ -192,7 +192,7 @@ class TaskImages(NamedTuple):
         m, n, H_star = self.s_start.shape[1] - self.pins, len(self.q_start), np.eye(4)
         images = np.array([undistort(model.lens, s) for s in (self.s_start, self.s_star)])
         unseen = np.zeros((len(model.P), len(self.body.M)), dtype=np.bool_)
-        task = new_task(model, self.s_star[:, :m], self.center, self.pair, self.least_views)._replace(
+        task = new_task(model, self.s_star[:, :m], self.center, self.pair, self.min_views)._replace(
             body=self.body._replace(in_goal=unseen)
         )
         require_found(*task_into(model, images, task, np.zeros((m, 4)), np.zeros(m)), self.view)
@@ -230,7 +230,7 @@ def body_task_into(
     """Complete the target points of a task by the whole body instead of the face alone.
 
     The partition of the task by the triangulated face predicts the pose at the goal, or the joints near it
-    where there is no pair of views; it is then fitted to all markers seen there.
+    if there is no pair of views; it is then fitted to all markers seen there.
 
     ends : joints (n,) at the start, rad or m, and near the goal, (0,) with a pair of views.
     images : (2, V, b, 2) undistorted pixels of the body at the start and at the goal, NaN if unseen.
@@ -308,7 +308,7 @@ def _followed_at(
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Shares (k, 3), joints (k, n), points (k, m, 4) and undistorted pixels (k, V, m, 2) at times (k,), s.
 
-    A joint-space path has no shares; its displacements are those of the joints.
+    A joint-space path has no shares; its displacements follow from the joints.
 
     The planned displacement carries the points to where the face should be. The error of the plan at the
     goal is corrected along the path, for points measured one by one and for images by the residual of the

@@ -78,7 +78,7 @@ class Reference(NamedTuple):
     H_hat: FloatArray  # (3, 4, 4) operators t, r, p of the plan
     amplitudes: FloatArray  # (3,) τ in the unit of Ĥ_t, θ_r and θ_p in rad
     mu: FloatArray  # (k, 3) shares; none for a joint-space path
-    q: FloatArray  # (k, n) joints, rad or m; k is 0 without a plan, else 2 or more
+    q: FloatArray  # (k, n) joints, rad or m; k is 0 without a plan, otherwise 2 or more
     A: FloatArray  # (k, m, 4) points of the face, a_inf·A = 1, before the displacement planned until then
     s: FloatArray  # (k, 2, m, 2) undistorted pixels of the face
     s_ahead: FloatArray  # (k, 2, m, 2) first-order motion of the pixels in the next period, px
@@ -130,7 +130,7 @@ def _between(column: FloatArray, i: int, x: float) -> float:
 def planned(model: Model, reference: Reference, clock: float) -> Mat4:
     """Displacement planned from the start until a time in periods, [RH00] eqs. (17), (18).
 
-    On a joint-space path it is that of the joints, eq. (6).
+    On a joint-space path it follows from the joints, eq. (6).
     """
     i, x = _row_before(reference, clock)
     if follows_joint_path(reference):

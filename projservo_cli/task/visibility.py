@@ -82,9 +82,9 @@ def choose_sense(a: Vec4, a_t: Vec4, H_r: Mat4, theta: float, task: Task, agains
     """Sense of the rotation onto the target plane, [RH00] section 4.2: θ or θ − 2π, 0 ≤ θ ≤ π.
 
     Both senses bring the front onto the front. The choice is the sense in which fewer cameras lose sight;
-    between equals, near half a turn the previous sense, else the larger worst margin. The axis lies in the
-    face, so a camera that sees the face at both ends of the shorter arc sees it throughout, and that common
-    case needs no search.
+    between equals, near half a turn the previous sense, otherwise the larger worst margin. The axis lies in
+    the face, so a camera that sees the face at both ends of the shorter arc sees it throughout, and that
+    common case needs no search.
     """
     visible = True
     for view in range(task.O.shape[0]):

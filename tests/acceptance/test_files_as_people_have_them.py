@@ -79,7 +79,7 @@ def test_case_03_and_07_of_urdfs(entered, told, name, code, words):
     ("text", "message"),
     [
         (urdf(*CHAIN, joint("lift", "hand", "tool"), links=LINKS + '<link name="tool"/>'), "2 times"),
-        (urdf(*CHAIN, links=LINKS + '<link name="fore"/>'), "link fore stands there 2 times"),
+        (urdf(*CHAIN, links=LINKS + '<link name="fore"/>'), "link fore occurs 2 times"),
         (urdf(*CHAIN[1:], joint("pan", "hand", "upper")), "closes a loop"),
         (urdf(CHAIN[0], CHAIN[1].replace('"upper"', '"uper"', 1), CHAIN[2]), "lift: there is no link uper"),
         (urdf(*CHAIN[:2], joint("roll", "fore", "hand", LIMIT, more=LIMIT)), "roll has 2 elements limit"),

@@ -31,7 +31,7 @@ def test_a_chain_of_another_rig(answer, elsewhere, types, views, mount):
     assert len(found["suggestions"]) == 1
     code, _, error = answer(*words, "-o", "other", "--image-size", ",".join(sizes))
     assert code == 2
-    assert f"4 image sizes for the views {', '.join(found['view'])}: give one, or one a view" in error
+    assert f"4 image sizes for the views {', '.join(found['view'])}: give one, or one per view" in error
     code, value, _ = answer("validate", "out", "--data", "ahead.csv")
     assert (code, value["count"]) == (0, views * 8 * 8)
     assert value["median_px"] <= value["limit_px"]

@@ -137,7 +137,7 @@ def test_a_run_has_the_start_and_goal_of_its_plan(config, made):
     with pytest.raises(ps.InputError, match=r"another task than the configuration: it starts 0\.05 rad"):
         ps.servo(config, calibration, unasked)
     other = dataclasses.replace(ps.plan(config, calibration, goal=goal), asked=(None, None))
-    with pytest.raises(ps.InputError, match=r"its goal images are .* px from those of task\.goal"):
+    with pytest.raises(ps.InputError, match=r"its goal images are .* px from task\.goal"):
         ps.servo(config, calibration, other)
 
 
@@ -354,7 +354,7 @@ REFUSED = [
     (lambda c, k, p: ps.sweep(c, laws=["exact"], runs=0), "^sweep: runs: must be at least 1, not 0$"),
     (lambda c, k, p: ps.sweep(c, laws=[]), "sweep: name one law or more"),
     (lambda c, k, p: ps.sweep(c, laws="exact"), r"sweep: laws 'exact': give a list of them, such as laws=\["),
-    (lambda c, k, p: ps.sweep(c, laws=[Resolved, Resolved]), "grid.law: a value stands there twice"),
+    (lambda c, k, p: ps.sweep(c, laws=[Resolved, Resolved]), "grid.law: a value occurs there twice"),
     (lambda c, k, p: ps.plan(c, k, q_start=np.degrees(p.q_start)), "q_start: .* two turns in rad"),
     (lambda c, k, p: ps.plan(c, k, q_start=[1, 2]), r"q_start of shape \(2,\): expected \(6,\)"),
     (lambda c, k, p: ps.plan(c, k, goal=np.zeros((2, 3, 2))), r"\(6,\) joint readings, or \(2, 4, 2\)"),

@@ -162,5 +162,5 @@ def test_a_report_of_a_folder_that_is_not_there_takes_it_for_no_sweep(projservo,
     for more in ((), ("--set", "seed=2")):
         answer = projservo("report", "nowhere", *more)
         assert answer.code == 2
-        assert "nowhere: there is no such folder: name that of a run" in " ".join(answer.err.split())
+        assert "nowhere: there is no such folder: name the folder of a run" in " ".join(answer.err.split())
     assert not list(tmp_path.iterdir())

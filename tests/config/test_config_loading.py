@@ -126,7 +126,7 @@ INCONSISTENT = [
      "1 entries for 3 markers"),
     ("markers.face=[0, 1, 9]", "markers.face.2", "there is no marker 9"),
     ("features={pin: {on: tool, line: [0, 9]}}", "features.pin.line.1", "there is no marker 9"),
-    ("features={pin: {on: tool, line: [0, 0]}}", "features.pin.line", "a marker stands here twice"),
+    ("features={pin: {on: tool, line: [0, 0]}}", "features.pin.line", "a marker occurs here twice"),
     ("features={pin: {on: tool, line: [0, 1], point: [2]}}", "features.pin", "exactly one of point, line"),
     ("features={pin: {on: tool, point: []}}", "features.pin.point", "numbers of 1 to 100 markers"),
     ("features={Pin: {on: tool, point: [0]}}", "features.Pin", "a name of small letters"),

@@ -139,7 +139,7 @@ def test_a_mistake_with_tags_or_light_is_named_with_its_remedy(doctor, left, rig
 @pytest.mark.parametrize(
     ("left", "right", "words"),
     [
-        ("0", "/dev/video0", "cameras.right.source: is /dev/video0, that of the left camera as well"),
+        ("0", "/dev/video0", "cameras.right.source: is /dev/video0, also the device of the left camera"),
         ('"0"', "1", "cameras.left.source: is text: an index has no quotes: source: 0"),
         (
             "/dev/null",

@@ -264,7 +264,7 @@ MISTAKES = {
         r"servos \[4, 5, 6\] do not answer, \[1, 2, 3\] do: look at the cable",
     ),
     "two arms": (Faults(twice=(1, 2, 3, 4, 5, 6)), "every reply is garbled: two arms share this bus"),
-    "two pairs": (Faults(twice=(2, 5)), r"answers of servo 2 are garbled, those of \[1, 3, 4, 6\]"),
+    "two pairs": (Faults(twice=(2, 5)), r"answers of servo 2 are garbled, answers of \[1, 3, 4, 6\]"),
     "twice": (Faults(twice=(3,)), "answers of servo 3 are garbled.*two servos have this id"),
 }
 

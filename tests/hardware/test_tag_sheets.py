@@ -53,7 +53,7 @@ def test_printed_tags_are_found_at_their_size(projservo, tmp_path, kind, size_mm
     [
         (("--kind", "roof", "--size-mm", "60"), "a4 has 194 x 225 mm for them: take about 44 mm"),
         (("--size-mm", "150"), "a4 takes 0 tags with margins of 200 mm, not 1: take 145 mm at most"),
-        (("--numbers", "3,2-4"), "--numbers 3,2-4: tag 3 stands there 2 times"),
+        (("--numbers", "3,2-4"), "--numbers 3,2-4: tag 3 occurs 2 times"),
         (("--numbers", "3,60"), "there is no tag 60 in the dictionary, which has tags 0 to 49"),
         (("--numbers", "3,a"), "expected numbers of tags such as 0-4,7"),
         (

@@ -70,7 +70,9 @@ def test_the_margin_is_that_of_every_point_of_every_segment(k):
         assert margin <= one + 1e-2
         assert margin >= one - max(1.0, 0.5 * abs(one))
         # What predictions may be off is that of these joints, not the most that it is anywhere.
-        spread = Spread(*(x[None] for x in (truth.P, found.c.model.H_hat_0, found.c.M)), rest=1.0, most=9.0)
+        spread = Spread(
+            *(x[None] for x in (truth.P, found.c.model.H_hat_0, found.c.M)), rest=1.0, max_sigma=9.0
+        )
         off = found.c._replace(keep_out=keep_out_of([(drawn, False)]), spread=spread)
         if one > 8.0:
             assert margins_at(off, q)[0][CLEAR] == pytest.approx(margin - 3.0, abs=0.3 * margin)

@@ -66,7 +66,7 @@ def test_limits_from_data_are_what_they_cover_widened_by_a_share_of_it(mine):
     ("limits", "told"),
     [
         ("{}", "robot.limits: give exactly one of joints and from_data"),
-        ("{from_data: 0.1, unit: rad}", "robot.limits.unit: is that of joints"),
+        ("{from_data: 0.1, unit: rad}", "robot.limits.unit: applies to joints"),
         ("{joints: [[0, 1], [2, 1]], unit: rad}", "robot.limits.joints.1: the lower limit 2 must be below"),
         ("{joints: [[0, 1]], unit: rad}", "robot.limits.joints: 1 pairs for 6 joints (RRRRRR)"),
         ("{from_data: -1}", "robot.limits.from_data: must be at least 0"),

@@ -127,9 +127,7 @@ def test_a_part_and_the_scene_are_in_one_goal():
         assert trace.incidence_mm.max() < 1.5 * planned.goal_deviation_mm
     # What carries the hole does not carry the table.
     assert trace.incidence_deviation_mm[0] > planned.goal_deviation_mm > trace.incidence_deviation_mm[1]
-    with pytest.raises(
-        InputError, match="are on block and scene, so teach the approach as a goal of its own"
-    ):
+    with pytest.raises(InputError, match="are on block and scene, so teach the approach as a separate goal"):
         plan.run(
             config.replace({"task.goal.displaced": {"along": "pin", "by_m": 0.05}}),
             calibration,
@@ -205,7 +203,7 @@ def test_features_of_markers_of_an_object_need_a_look_at_it_and_are_not_displace
     config = insertion({"block": BLOCK}, features, "[[tip, spot]]")
     calibration = calibrate.run(config)[1]
     scenario = run_scenario(servo_inputs(config), calibration)
-    with pytest.raises(WorkFailed, match="tip on spot: nobody has looked where its object is: plan first"):
+    with pytest.raises(WorkFailed, match="tip on spot: its object was not located: plan first"):
         scenario.ends.task(scenario.world.model)
     away = config.replace({"task.goal.displaced": {"along": "pin", "by_m": 0.02}})
     with pytest.raises(InputError, match="spot is of markers of block, which are not displaced: teach the"):

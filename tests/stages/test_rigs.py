@@ -104,7 +104,7 @@ def test_a_plan_through_joint_space_keeps_what_it_asks_of_the_views(rig):
     config, calibration, _ = chain(rig)
     made = plan.run(rigged(rig, "trajectory.profile=joint_space"), calibration)
     assert made.feasible, made.reason
-    truth, least = truth_of(config), scenario_of(config, calibration).world.least_views
+    truth, least = truth_of(config), scenario_of(config, calibration).world.min_views
     for q in made.q:
         s = truth.images(q, truth.M_face)
         size = truth.image_size[:, None]
@@ -170,7 +170,7 @@ def test_what_a_rig_cannot_do_is_told():
     drawn = "trajectory.keep_out=[{left: [[0, 0], [9, 0], [9, 9]]}]"
     with pytest.raises(InputError, match=r"left is no view; the views are webcam"):
         plan.run(rigged("one", drawn, "control.mode=track"), calibration)
-    with pytest.raises(InputError, match=r"trajectory\.keep_out: are regions of images that stand still"):
+    with pytest.raises(InputError, match=r"trajectory\.keep_out: are regions of fixed images"):
         rigged("hand", drawn, "control.mode=track")
     with pytest.raises(InputError, match=r"the calibration is of webcam .mount world., and the rig"):
         plan.run(rigged("eye"), calibration)

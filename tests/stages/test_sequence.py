@@ -137,7 +137,7 @@ def test_the_first_step_that_fails_stops_and_says_what_is_held(call):
         ({"steps": [{"retreat": {"along": "tip", "by_m": 0.1}}, STEPS[2]]}, "tip is a point, which has no"),
         ({"steps": [{"retreat": {"along": "hook", "by_m": 0.1}}, STEPS[2]]}, "there is no feature hook;"),
         ({"start": "curent"}, "did you mean current?"),
-        ({"start": "current", "start_offset": {"joints": [0] * 6, "unit": "rad"}}, "is that of joints"),
+        ({"start": "current", "start_offset": {"joints": [0] * 6, "unit": "rad"}}, "applies to joints"),
         ({"steps": [{"to": "in_hole"}], "start": "nowhere.yaml"}, "there is no .*nowhere.yaml yet: teach"),
     ],
 )

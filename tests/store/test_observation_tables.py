@@ -27,7 +27,7 @@ BAD = {
     "gap in joints": ([HEADER.replace("q2", "q3"), ROWS[0]], ":1: joint column q2 is missing"),
     "column twice": ([HEADER.replace("q2", "q1"), ROWS[0]], ":1: .*q1 more than once"),
     "joints from zero": ([HEADER.replace("q2", "q0"), ROWS[0]], ":1: the header has q0"),
-    "row cut short": ([HEADER, ROWS[0], "0,0,0.5,-1,11,2"], ":3: 6 cells where the header has 8"),
+    "row cut short": ([HEADER, ROWS[0], "0,0,0.5,-1,11,2"], ":3: 6 cells, but the header has 8"),
     "text for a number": ([HEADER, ROWS[0].replace("10", "ten")], ":2: u_left is 'ten'"),
     "nan": ([HEADER, ROWS[0].replace("10", "nan")], ":2: one of u_left, v_left is empty"),
     "infinite": ([HEADER, ROWS[0].replace("10", "1e999")], ":2: u_left is '1e999'"),

@@ -113,7 +113,7 @@ def test_what_no_run_can_be_made_of_is_refused_before_any_is(given, message):
         ("base: paper.yaml\nrandom: {control.gain_t: {uniform: [3, 1]}}\n", "a minimum below the maximum"),
         ("base: paper.yaml\nrandom: {control.gain_t: {}}\n", "exactly one of uniform"),
         ("base: paper.yaml\ngrid: {law: []}\n", "grid.law"),
-        ("base: paper.yaml\ngrid: {control.gain: [1, 1]}\n", "a value stands there twice"),
+        ("base: paper.yaml\ngrid: {control.gain: [1, 1]}\n", "a value occurs there twice"),
         (
             "base: paper.yaml\ntasks: {random: 3}\ngrid: {task.goal.roll_deg: [1, 2]}\n",
             "task.goal.roll_deg has no effect, since tasks take its place: use tasks.listed",

@@ -61,7 +61,7 @@ def test_what_cannot_be_displaced_is_refused_in_one_line():
     for asked, metre, error, words in (
         (StandOff("pin", line, 0.05, None), np.nan, InputError, "by_m needs a known length .* by_px"),
         (StandOff("pin", ((4,), (4,)), 0.05, None), 1.0, WorkFailed, "points of pin span no line"),
-        (StandOff("pin", line, None, 1e9), 1.0, WorkFailed, "no way along pin moves the images by"),
+        (StandOff("pin", line, None, 1e9), 1.0, WorkFailed, "no distance along pin moves the images by"),
     ):
         with pytest.raises(error, match=words) as refused:
             displaced(model, M, q, asked, np.eye(4), metre)

@@ -85,7 +85,7 @@ class _Grid:
         return float(np.linalg.norm(moved[:, :2] / moved[:, 2:] - image, axis=1).max() / cell)
 
     def orientations(self, image: FloatArray, camera: FloatArray) -> FloatArray:
-        """Rotations (g, 3, 3) of the board by each numbering of pixels (N, 2), NaN where few are seen."""
+        """Rotations (g, 3, 3) of the board by each numbering of pixels (N, 2), NaN if few are seen."""
         seen = np.isfinite(image[:, 0])
         if seen.sum() <= 2 * _LEAST_SIDE:
             return np.full((len(self.numberings), 3, 3), np.nan)
@@ -105,14 +105,14 @@ class BoardNumbering:
     """Observations of a board, and the turn of its numbering in each image."""
 
     given: Observation  # as numbered by the detector
-    grid: _Grid | None  # None where the markers are none of a board
+    grid: _Grid | None  # None if the markers are none of a board
     turn: IntArray  # (K, V) index of the numbering that is right
     decided: BoolArray  # (K, V) whether neighbours decide on an image, with most others of its view
-    looks: int = 0  # how many fits turned further images
+    fits: int = 0  # how many fits turned further images
 
     @classmethod
     def of(cls, observation: Observation) -> "BoardNumbering":
-        """Infer the board from the images; every number stands as it is."""
+        """Infer the board from the images; every number stays as it is."""
         shape, grid = observation.images.shape[:2], _Grid.in_images(observation)
         return cls(observation, grid, np.zeros(shape, dtype=np.int64), np.ones(shape, dtype=np.bool_))
 
@@ -144,10 +144,10 @@ class BoardNumbering:
 
     def turn_by(self, calibration: Calibration) -> bool:
         """Turn images that fit a calibration far better so; whether there were any, at ever fewer looks."""
-        if self.grid is None or self.looks >= _MAX_LOOKS:
+        if self.grid is None or self.fits >= _MAX_LOOKS:
             return False
         more = _turns_by(self.grid, self.observation, calibration)
-        self.turn, self.looks = (self.turn + more) % len(self.grid.numberings), self.looks + 1
+        self.turn, self.fits = (self.turn + more) % len(self.grid.numberings), self.fits + 1
         return bool(more.any())
 
     @property
@@ -172,7 +172,7 @@ class BoardNumbering:
 
 
 def _proven_turns(grid: _Grid, observation: Observation, joint_types: str) -> tuple[IntArray, BoolArray]:
-    """Turns (K, V) of images that joint readings and views prove, else zero, and which they decide."""
+    """Turns (K, V) of images that joint readings and views prove, otherwise zero, and which they decide."""
     K, V = observation.images.shape[:2]
     turns = np.array([letter.upper() == "R" for letter in joint_types])
     step = np.abs(np.angle(np.exp(1j * (observation.q[:, None] - observation.q)[..., turns]))).sum(axis=-1)
@@ -196,7 +196,7 @@ def _proven_turns(grid: _Grid, observation: Observation, joint_types: str) -> tu
                 noise[k] = Epipolar.of(pair, np.random.default_rng(0)).sigma_px
         if noise.min() < _DECIDED * noise[0]:
             turn[largest[v], v] = (turn[largest[v], v] + int(np.argmin(noise))) % g
-    # No image shows which end is the first: that of most.
+    # No image shows which end is the first: take the end that most images take.
     kept = np.stack(largest, axis=1)
     counts = np.bincount(turn[kept], minlength=g)
     turn[kept] = (turn[kept] - int(np.argmax(counts))) % g
@@ -231,7 +231,7 @@ def _turns_of_view(grid: _Grid, images: FloatArray, step: FloatArray) -> tuple[I
 
 
 def _turns_by(grid: _Grid, observation: Observation, calibration: Calibration) -> IntArray:
-    """Turns (K, V) with which images fit a calibration far better than as numbered; else zero."""
+    """Turns (K, V) with which images fit a calibration far better than as numbered; otherwise zero."""
     predicted = np.full(observation.images.shape, np.nan)
     of_known = predict(calibration, observation.q)[:, :, np.isin(calibration.marker, observation.marker)]
     predicted[:, :, np.isin(observation.marker, calibration.marker)] = of_known

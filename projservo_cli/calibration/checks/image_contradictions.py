@@ -26,17 +26,17 @@ _DOUBTED = 0.5
 _ALIKE = 0.1
 # Noise of the epipolar geometry, px, above which most of the numbers may be wrong.
 _MUCH_NOISE_PX = 1.0
-# Maximum noise of images paired with those of the next pose, over that of images of one pose, of a late view.
+# Maximum noise of images paired with images of the next pose, over the noise within one pose, of a late view.
 _LESS = 0.7
 # Residual of a corner, in deviations of the geometry of few points, above which it misfits.
 _OF_FEW = 15.0
-# Share of the detections of a pose that misfit the geometry of others where a camera moved, and minimum
+# Share of the detections of a pose that misfit the geometry of others if a camera moved, and minimum
 # number of such poses.
 _MISFIT, _LEAST_MOVED = 0.5, 5
 # Minimum number of poses before and after images change their size, number of onsets that are tried, and
 # noise of images of one size over that as they are.
 _LEAST_RESIZED, _ONSETS, _ONE_SIZE = 4, 3, 0.5
-# Noise of images of one size over that of those before they changed, which counts as much again.
+# Noise of images of one size over the noise before they changed, which counts as much again.
 _LIKE_FIRST = 1.5
 # Maximum number of tags whose own geometry is tried.
 _MAX_TAGS = 6
@@ -49,7 +49,7 @@ _EXAMPLES = 3
 def checked_geometry(detections: Detections, frame: ImageFrame, rng: np.random.Generator) -> ImageGeometry:
     """Estimate the geometry of images; refuse views that number markers differently, or show other poses.
 
-    The images do not tell which view is right, and goals are given by numbers, so nothing is renumbered.
+    The images do not show which view is right, and goals are given by numbers, so nothing is renumbered.
 
     Raises WorkFailed naming the tags or markers, the view that is late or the pose at which one moved, or as
     ``Epipolar.of`` does.
@@ -77,7 +77,7 @@ def checked_geometry(detections: Detections, frame: ImageFrame, rng: np.random.G
 
 
 def _noise_px(detections: Detections) -> float:
-    """Noise of the epipolar geometry, px, though it shows no depth; infinite where there is none."""
+    """Noise of the epipolar geometry, px, though it shows no depth; infinite if there is none."""
     try:
         return Epipolar.fitted(detections, np.random.default_rng(0)).sigma_px
     except WorkFailed:
@@ -85,7 +85,7 @@ def _noise_px(detections: Detections) -> float:
 
 
 def _require_one_pose(detections: Detections, noise_px: float) -> None:
-    """Refuse images of one view that show the pose before that of the other: so their noise is far less.
+    """Refuse images of one view that lag the other by a pose, if shifting them lowers the noise much.
 
     noise_px : of the images as they are paired.
     """
@@ -129,14 +129,14 @@ def _require_one_size(detections: Detections, frame: ImageFrame, noise_px: float
 
 
 def _epipolar(detections: Detections) -> Epipolar | None:
-    """Epipolar geometry of images, or None where they show none."""
+    """Epipolar geometry of images, or None if they show none."""
     with suppress(WorkFailed):
         return Epipolar.of(detections, np.random.default_rng(0))
     return None
 
 
 def _geometry(detections: Detections, frame: ImageFrame) -> ImageGeometry | None:
-    """Geometry of images of one view or two, or None where they show none."""
+    """Geometry of images of one view or two, or None if they show none."""
     if len(detections.pair) > 1:
         return _epipolar(detections)
     with suppress(WorkFailed):
@@ -167,7 +167,7 @@ def size_changes(detections: Detections) -> list[tuple[int, float]]:
 
 
 def _log_sizes(detections: Detections) -> FloatArray:
-    """Logarithm (K,) of distance from the corner and extent of what images show; NaN if unseen."""
+    """Logarithm (K,) of distance from the corner and extent of the visible markers; NaN if unseen."""
     pixels = detections.dense() + 0.5
     seen = np.isfinite(pixels[..., 0])
     count = np.where(seen.sum(axis=2) > 1, seen.sum(axis=2), np.nan)
@@ -192,7 +192,7 @@ def _require_one_rig(detections: Detections) -> None:
 
 
 def _misfitting(detections: Detections, half: BoolArray) -> BoolArray:
-    """Whether each pose (K,) misfits the geometry of some poses (K,); none where these show none."""
+    """Whether each pose (K,) misfits the geometry of some poses (K,); none if these show none."""
     K, geometry = len(detections.q), _epipolar(detections.of_poses(half))
     if geometry is None:
         return np.zeros(K, dtype=np.bool_)
@@ -202,7 +202,7 @@ def _misfitting(detections: Detections, half: BoolArray) -> BoolArray:
 
 
 def _require_alike(detections: Detections, order: IntArray) -> None:
-    """Refuse an order (m,) of the markers in the right view, unless it is that of the left one."""
+    """Refuse an order (m,) of the markers in the right view, unless the left view has the same order."""
     moved = np.flatnonzero(order != np.arange(order.size))
     if not moved.size:
         return
@@ -213,7 +213,7 @@ def _require_alike(detections: Detections, order: IntArray) -> None:
 
 
 def _exchanged(pairs: list[tuple[int, int]]) -> list[Finding]:
-    """Return numbers in the left view and in the right one, by tags where they are whole tags."""
+    """Return numbers in the left view and in the right one, by tags if they are whole tags."""
     right, found, rest = dict(pairs), [], []
     for left, other in pairs:
         t, u = left // _CORNERS, other // _CORNERS
@@ -262,7 +262,7 @@ def _true_order(detections: Detections, epipolar: Epipolar, limit: float) -> Int
     wrong = np.bincount(detections.marker_of[misfit], minlength=m) > _DOUBTED * count
     order = np.arange(m)
     doubted = np.isin(detections.marker // _CORNERS, detections.marker[wrong] // _CORNERS)
-    doubted &= count >= _MIN_POSES  # with the other corners of their tags, which may fit along a line
+    doubted &= count >= _MIN_POSES  # also the other corners of their tags, which may fit along a line
     if not (wrong & doubted).any():
         return order
     which = np.flatnonzero(doubted)
@@ -285,7 +285,7 @@ def _dense(detections: Detections, which: IntArray) -> FloatArray:
 
 
 def _misfits(pixels: FloatArray, F: FloatArray, limit: float) -> FloatArray:
-    """Shares (s, s) of the poses at which markers of the left view misfit those of the right one."""
+    """Shares (s, s) of the poses at which markers of the left view misfit markers of the right view."""
     left, right = homogeneous(pixels)
     found = np.ones((left.shape[1], right.shape[1]))
     for i in range(len(found)):

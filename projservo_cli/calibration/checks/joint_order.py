@@ -34,7 +34,7 @@ def undecided_pairs(solution: Solution, sigma_px: float) -> IntArray:
 
     A pair is open if the images allow an order that inverts it, and of the joints between them each with one
     of both. Operators go with their joints, so single-joint trials stay as they are. An order is excluded
-    where it moves the images, cleared of the parameters' derivatives, by more than noise; so are all orders
+    if it moves the images, cleared of the parameters' derivatives, by more than noise; so are all orders
     that invert the same pairs and more.
     """
     scale = max(solution.problem.detections.marker.size / _MARKERS, 1.0)
@@ -93,16 +93,16 @@ def _effect(solution: Solution, i: int, j: int) -> float:
 def require_poses(detections: Detections) -> None:
     """Refuse poses that show hardly more of the arm, or of joints in a row, than these have.
 
-    With as many numbers as unknowns an arm is one of finitely many, and no residual tells which: of 34 sets
-    of five poses of a UR5 six predicted images 18 to 40 times worse than stated. With one motion to spare 1
-    of 120 was beyond 3 times. Raises WorkFailed with both numbers and the number of poses to record.
+    With as many numbers as unknowns an arm is one of finitely many, and no residual decides between them: of
+    34 sets of five poses of a UR5 six predicted images 18 to 40 times worse than stated. With one motion to
+    spare 1 of 120 was beyond 3 times. Raises WorkFailed with both numbers and the number of poses to record.
     """
     q, n = np.round(detections.q[np.unique(detections.pose_of)] / SAME_READING), detections.prismatic.size
     for i, j in sorted(combinations(range(n + 1), 2), key=lambda ends: ends[0] - ends[1]):
         poses, own = len(np.unique(q[:, i:j], axis=0)), _OF_REVOLUTE * (j - i)
         own -= (_OF_REVOLUTE - _OF_PRISMATIC) * int(detections.prismatic[i:j].sum())
         needed, shown = own + min(_SPARE * (j - i), _OF_MOTION), _OF_MOTION * (poses - 1)
-        if shown >= needed or j - i == 1:  # of a single joint range and noise decide
+        if shown >= needed or j - i == 1:  # range and noise decide for a single joint
             continue
         first, last = sorted(detections.numbers[[i, j - 1]].tolist())
         of = Subject() if j - i == n else Subject(joints=tuple(range(first, last + 1)))

@@ -1,7 +1,7 @@
-"""Markers that do not move as the tool does: they stand still, sit on a link, creep, or slipped.
+"""Markers that do not move as the tool does: they are fixed, sit on a link, creep, or slipped.
 
 A few of them leave a fit of all others as it is, so each is asked by itself, with the robot as fitted: which
-motion of its own explains its images. Each such motion is exact or to first order of a small shift.
+separate motion explains its images. Each such motion is exact or to first order of a small shift.
 """
 
 from collections import Counter
@@ -20,10 +20,10 @@ from projservo_cli.records import CORNERS, BoolArray, FloatArray, IntArray
 
 # Minimum number of images of a marker, and of markers that are left.
 _IMAGES, _LEFT = 6, 3
-# Squared residuals of a marker over those of the others, from which it is asked, and maximum share of them
+# Squared residuals of a marker over the others, from which it is tested, and maximum share of them
 # that its own motion leaves.
 _OFF, _EXPLAINED = 4.0, 0.4
-# Gain in squared residuals for each number of a motion, over those of the others, from which it is named.
+# Gain in squared residuals for each number of a motion, over the others, from which it is named.
 _DECISIVE = 50.0
 # Motions that corners of a tag have together, and number of them from which it is one.
 _OF_TAGS, _OF_A_TAG = ("marker_drift", "marker_step"), 3
@@ -32,7 +32,7 @@ _STEPS, _ONSETS, _SHARE = 8, 16, 1.0 / 3.0
 
 
 def motionless(detections: Detections) -> BoolArray:
-    """Mask (m,) of markers whose images stand still in all views while those of the others move."""
+    """Mask (m,) of markers whose images rest in all views while the others move."""
     pixels = detections.dense()
     seen = np.isfinite(pixels[..., 0])
     count = seen.sum(axis=1)
@@ -43,14 +43,14 @@ def motionless(detections: Detections) -> BoolArray:
         spread[v, j] = np.median(np.linalg.norm(track - np.median(track, axis=0), axis=1))
     if detections.marker.size > MAX_JUDGED or not asked.any(axis=1).all():
         return np.zeros(detections.marker.size, dtype=np.bool_)
-    most = np.array([np.max(of_view[np.isfinite(of_view)]) for of_view in spread])
-    still = ~asked | ((spread < STILL_PX) & (spread < STILL_SHARE * most[:, None]))
+    max_spread = np.array([np.max(of_view[np.isfinite(of_view)]) for of_view in spread])
+    still = ~asked | ((spread < STILL_PX) & (spread < STILL_SHARE * max_spread[:, None]))
     found = np.asarray(still.all(axis=0) & asked.any(axis=0))
     return found if (~found).sum() >= _LEFT else np.zeros_like(found)
 
 
 def motionless_finding(detections: Detections, which: BoolArray) -> Finding:
-    """Return the finding on markers (m,) that stand still."""
+    """Return the finding on stationary markers (m,)."""
     numbers = tuple(detections.marker[which].tolist())
     return Finding("standing_markers", LIMITS, Subject(markers=numbers), len(numbers), unit="1")
 
@@ -69,10 +69,10 @@ def without_strange(solution: Solution, noise_px: float) -> tuple[Solution, tupl
     noise_px : of the rig.
     """
     detections = solution.problem.detections
-    if detections.marker.size > MAX_JUDGED:  # of many tracks a fit rejects those that drift
+    if detections.marker.size > MAX_JUDGED:  # a fit rejects drifting ones among many tracks
         return solution, ()
     found = {j: motion.finding for j, motion in _strange(solution)}
-    # A tag that slips or creeps is found as one, by what is rejected of it.
+    # A tag that slips or creeps is found as one tag, by its rejected detections.
     moved = [detections.marker[j] // CORNERS for j, one in found.items() if one.code in _OF_TAGS]
     tags = {tag for tag, count in Counter(moved).items() if count >= _OF_A_TAG}
     found = {j: one for j, one in found.items() if detections.marker[j] // CORNERS not in tags}
@@ -85,7 +85,7 @@ def without_strange(solution: Solution, noise_px: float) -> tuple[Solution, tupl
 
 
 def _strange(solution: Solution) -> Iterator[tuple[int, _Motion]]:
-    """Yield markers, by their index, that a motion of their own explains."""
+    """Yield markers, by their index, that a separate motion explains."""
     problem, detections = solution.problem.with_noise(None), solution.problem.detections
     m = detections.marker.size
     squares = np.where(detections.seen, np.square(problem.residual(solution.params)).sum(axis=2), 0.0)
@@ -111,7 +111,7 @@ class _Track:
         q = problem.joints(self.params)[self.detections.pose_of]
         E = displacements(self.params.H_hat, self.params.prismatic, self.params.turned(q))
         self.motion = np.broadcast_to(np.eye(4), (len(rows), 4, 4))
-        self.before = []  # motions (N, 4, 4) of what each joint carries, from the base on
+        self.before = []  # motions (N, 4, 4) of the part that each joint carries, from the base on
         for by_joint in E:
             self.before.append(self.motion)
             self.motion = self.motion @ by_joint
@@ -143,7 +143,7 @@ class _Track:
         return best
 
     def motions(self) -> Iterator[_Motion]:
-        """Yield motions of its own: with a link, or standing; creeping; slipped at a pose."""
+        """Yield separate motions: with a link, or at rest; creeping; slipped at a pose."""
         detections, number = self.detections, int(self.detections.marker[self.j])
         numbers = detections.numbers
         for i, motion in enumerate(self.before):

@@ -1,7 +1,7 @@
-"""Relabellings of data: each takes a row for what it is not, and the model may fit with it.
+"""Relabellings of data: each reads a row as another one, and the model may fit with it.
 
 A row says which discrete thing is as given and may not be: where the cameras are, the order of joints and of
-images, the type of a joint, a joint that stands still or turns with another, its unit, the size of images
+images, the type of a joint, a joint that rests or turns with another, its unit, the size of images
 from a pose on. All are tried in one way, before a deviation from the model absorbs them: a rough fit compares
 them, and the best are fitted completely.
 """
@@ -34,7 +34,7 @@ _SHIFTED, _ONSETS = ("images_late_from", "images_early_from"), 8
 _SHARES, _MOST_KEPT = (0.03, 0.07, 0.15), 0.5
 # Number of adjustment steps of the screws by which they are compared before.
 _SCREW_STEPS = 8
-# Log residual added to a joint of the other type, which explains more: one that stands still is simpler.
+# Log residual added to a joint of the other type, which explains more: a joint at rest is simpler.
 _SIMPLER = 0.1
 # Readings, rad, that are degrees if they range over more, or may be if they range over less.
 _TURN, _HARDLY = 2.0 * np.pi, 0.2
@@ -76,7 +76,7 @@ class _Data(NamedTuple):
         return self.with_(code, subject, "1", len(later), q=np.vstack([q[:at], later]))
 
     def dated(self, one: Relabelling, found: Solution) -> Relabelling:
-        """Return images that are late, or early, from the pose on from which a fit says so."""
+        """Return delayed or early images, from the pose on at which a fit shows it."""
         d, K, problem = self.detections, len(self.detections.q), found.problem
         levels = []
         for q in (d.q, self.shifted(one.finding.code, 1).detections.q):
@@ -84,7 +84,9 @@ class _Data(NamedTuple):
             off = np.linalg.norm(there.residual(dataclasses.replace(found.params, offsets=None)), axis=2)
             square = np.log(np.square(off / found.sigma_px).sum(axis=0) + 1.0)
             levels.append(np.bincount(d.pose_of, square, K))
-        left = np.cumsum(levels[0]) + np.cumsum(levels[1][::-1])[::-1]  # of the poses around each onset
+        left = (
+            np.cumsum(levels[0]) + np.cumsum(levels[1][::-1])[::-1]
+        )  # levels of the poses around each onset
         at = 1 + int(np.argmin(left[:-1] - levels[1][:-1]))
         return self.shifted(one.finding.code, min(at, K - 2))
 
@@ -139,8 +141,8 @@ def _types(data: _Data) -> Iterator[Relabelling]:
         yield data.with_("joint_type", subject, "rad" if slides else "m", prismatic=flipped)
 
 
-def _standing(data: _Data) -> Iterator[Relabelling]:
-    """A joint that stands still while its readings move."""
+def _stationary(data: _Data) -> Iterator[Relabelling]:
+    """A joint at rest while its readings move."""
     d = data.detections
     for i in range(d.prismatic.size if d.prismatic.size > 1 else 0):
         fewer: dict[str, Any] = {"q": np.delete(d.q, i, axis=1), "prismatic": np.delete(d.prismatic, i)}
@@ -159,7 +161,7 @@ def _exchanged(data: _Data) -> Iterator[Relabelling]:
 
 
 def _couplings(data: _Data) -> Iterator[Relabelling]:
-    """A joint that another one beside it turns as far as itself: a parallelogram, or a belt."""
+    """A joint that its neighbour turns as far as itself: a parallelogram, or a belt."""
     d = data.detections
     for read, moved in permutations(range(d.prismatic.size), 2):
         if abs(read - moved) > 1 or d.prismatic[[read, moved]].any():
@@ -260,7 +262,7 @@ def _with_rotations(T: FloatArray, R: Rotation) -> FloatArray:
 # What makes a relabelling exact that was tried with one of many numbers, by a fit with it.
 _NEARER = dict.fromkeys(_SHIFTED, (_Data.dated,)) | {"tracker_memory": (_Data.sharper,) * 3}
 # All relabellings by which the same images may fit: the simple ones first, then those by which more would.
-SIMPLE = (_mounts, _orders_of_images, _types, _standing)
+SIMPLE = (_mounts, _orders_of_images, _types, _stationary)
 OTHERS = (_exchanged, _couplings, _parallelograms, _units, _sizes, _images_shifted_from, _memories)
 # Those of poses of the flange, which are no joints.
 OF_POSES = ((_mounts, _orders_of_images, _poses), (_sizes, _images_shifted_from, _memories))
@@ -304,7 +306,7 @@ def _best(data: _Data, search: Search, max_px: float, tried: Sequence[Relabellin
                 params = minimize(
                     problem, start, seen, robust=True, cameras=start.known_arm, max_steps=_SCREW_STEPS
                 ).params
-                # In logarithms neither a few gross errors nor many small ones outweigh the rest.
+                # Logarithms: neither a few gross errors nor many small ones outweigh the rest.
                 level = np.mean(np.log(np.linalg.norm(problem.residual(params)[seen], axis=1) + 1e-9))
                 simpler = _SIMPLER if one.finding.code == "joint_type" else 0.0
                 candidates.append((float(level) + simpler, one, problem, params))

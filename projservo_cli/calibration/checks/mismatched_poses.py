@@ -13,7 +13,7 @@ from projservo_cli.records import BoolArray, IntArray
 
 # Median residual, in σ, below which something explains a pose.
 EXPLAINED = 3.0
-# Minimum share of the detections of an image that are rejected where its camera moved, or it shows another
+# Minimum share of the detections of an image that are rejected if its camera moved, or it shows another
 # pose, and minimum number of them: two more than its motion has coordinates, to test it.
 MOSTLY, SEEN_OF_IMAGE = 0.5, 4
 # Steps of Gauss and Newton to the reading of a joint, and median residual by the next joint over that by it.
@@ -27,7 +27,7 @@ _EXPLAINS, _OF_NOISE, _MOST_JOINTS, _ORDERED = 0.2, 1.5, 6, 8
 def imaged_poses(solution: Solution, out: BoolArray) -> IntArray:
     """Images (P, 3), row of the pose, view and row of the pose that they show; others of that pose are kept.
 
-    out : (V, N) rejected detections, most of those of each of these images.
+    out : (V, N) rejected detections, the majority in each of these images.
     """
     detections, found = solution.problem.detections, list[tuple[int, int, int]]()
     if not out.any():
@@ -52,17 +52,17 @@ def imaged_poses(solution: Solution, out: BoolArray) -> IntArray:
     return np.array(found, dtype=np.int64).reshape(-1, 3)
 
 
-def findings_on_imaged_poses(detections: Detections, shown: IntArray) -> Iterator[Finding]:
+def findings_on_imaged_poses(detections: Detections, mismatched: IntArray) -> Iterator[Finding]:
     """Findings on images (P, 3) that show other poses, one for each view."""
     for v, name in enumerate(detections.view):
-        if (of_view := shown[shown[:, 1] == v]).size:
+        if (of_view := mismatched[mismatched[:, 1] == v]).size:
             poses, others = (tuple(detections.pose[of_view[:, i]].tolist()) for i in (0, 2))
             instead = Finding("shown_poses", subject=Subject(poses=others))
             yield Finding("other_pose", LIMITS, Subject(views=(name,), poses=poses), others=(instead,))
 
 
 def erring_joint(solution: Solution, poses: IntArray) -> Finding | None:
-    """Find the one joint whose readings alone are off at poses, by rows, that a fit rejects.
+    """Find the one joint whose readings alone are wrong at poses, by rows, that a fit rejects.
 
     Of joints with parallel axes several explain them.
     """
@@ -90,8 +90,8 @@ def erring_joint(solution: Solution, poses: IntArray) -> Finding | None:
 def other_order(solution: Solution, poses: IntArray) -> bool:
     """Whether joints in another order explain poses, by rows, that a fit rejects.
 
-    Trials of one joint each give its operator, whatever the order; of many joints only neighbours are tried
-    in each other's places.
+    Trials of one joint each give its operator, whatever the order; with many joints, only neighbours are
+    tried in each other's places.
     """
     solution = solution.thinned(_ORDERED)
     problem, params = solution.problem, solution.params

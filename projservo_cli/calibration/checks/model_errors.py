@@ -3,7 +3,7 @@
 An arm or a rig that is not as the model says leaves residuals. Each nuisance, such as the gear ratio of a
 joint, changes the images by known columns Z to first order. Cleared of all fitted parameters they give its
 amplitude b without a refit (C. R. Rao, "Large sample tests of statistical hypotheses concerning several
-parameters", 1948). The fit absorbs a part of it, so images at other joints are off by (Z* − J* J⁺ Z) b.
+parameters", 1948). The fit absorbs a part of it, so images at other joints err by (Z* − J* J⁺ Z) b.
 
 Nuisances are selected one by one, by their posterior odds under a prior of the width that suits each best
 (E. George, D. Foster, "Calibration and empirical Bayes variable selection", Biometrika 87, 2000): a gain of
@@ -55,7 +55,7 @@ _TRIED = 4
 _AS_MUCH = 0.995
 # Logarithm of the odds, doubled, below which one nuisance explains the images as well as another: 20 to 1.
 _UNDECIDED = 6.0
-# Maximum number of others that are named beside a nuisance.
+# Maximum number of others that are named with a nuisance.
 _MAX_OTHERS = 2
 # Number of rounds in which a nuisance found may give way to a better one.
 _ROUNDS = 2
@@ -75,7 +75,7 @@ _MIN_CORNERS = 2
 _MAX_LEVERAGE = 0.999
 # Maximum number of terms of the root of leverages as a series, and their share at which it ends.
 _TERMS, _ROUNDING = 60, 1e-14
-# Maximum share of the squares of what images are off that a step leaves which is named.
+# Maximum share of the squared image errors that a named step leaves.
 _UNEXPLAINED = 0.2
 # Effect over the stated error from which a nuisance that the data could not have shown is named.
 _UNSHOWN = 2.0
@@ -91,7 +91,7 @@ class _Nuisance(NamedTuple):
     view: int | None
     columns: FloatArray  # (V, N, 2, d) weighted, by its amplitudes
     timed: int = ALWAYS  # when it acts
-    tag: int | None = None  # of a single tag
+    tag: int | None = None  # number, for a single tag
     period: float = np.nan  # rad or m, the best of those tried
 
     @property
@@ -132,7 +132,7 @@ class _Extent(NamedTuple):
         depth = np.array([[d[u].mean(), max(d[u].std(), 1e-12)] for d, u in zip(depths, used, strict=True)])
         half = np.maximum(0.5 * np.ptp(q, axis=0), 1e-9)
         middle = 0.5 * (q.min(axis=0) + q.max(axis=0))
-        radius = np.maximum(0.5 * (high - low).max(axis=1), 1.0)  # of a view of which one detection is left
+        radius = np.maximum(0.5 * (high - low).max(axis=1), 1.0)  # a view may have one detection left
         x = (problem.q - middle) / half
         return cls(middle, half, 0.5 * (low + high), radius, depth, _cycles(solution, x))
 
@@ -204,7 +204,7 @@ def _of_readings(
         found.append(_Nuisance(kind, (*others, i), None, columns, timed, period=period))
 
     def by_curve(row: Deviation, i: int, by: int) -> FloatArray:
-        """Change (K, d) of the readings of joint i by the functions of a row of those of another."""
+        """Change (K, d) of the readings of joint i by the functions of a row of the readings of another."""
         if "torque" in row.curve:
             return loads[:, i]
         if row.unit == SHARE:
@@ -256,7 +256,7 @@ def _of_view(
         add("lens", x[..., None] * np.concatenate([square, square**2], axis=2))
     if images.by_lens is not None and problem.lens_terms == LENS:
         add("lens_center", images.by_lens[v][..., LENS:])
-    else:  # of a lens that is estimated with its centre, or not at all: decentring, as by Brown
+    else:  # a lens estimated with its centre, or not at all: decentring, after Brown
         square, axes = (x**2).sum(axis=1)[:, None, None], np.broadcast_to(np.eye(2), (len(x), 2, 2))
         add("lens_center", square * axes + 2.0 * x[..., None] * x[:, None])
     mean, deviation = extent.depth[v]
@@ -307,7 +307,7 @@ class _Tests:
         self.edges = np.append(starts, counted.size)
         self.dof = max(solution.dof, 1)
         self.detections = problem.detections
-        # Weights of residuals in each view, and in the last entry in all: those of two views are near one.
+        # Weights of residuals in each view, and in the last entry in all: weights of two views are near one.
         weights = [problem.detections.weight[v, u] for v, u in enumerate(used)]
         weights.append(problem.detections.weight[used])
         self.weight = [1.0 if len(used) == 2 else float(np.sqrt(np.mean(w**2))) for w in weights]
@@ -336,7 +336,7 @@ class _Tests:
         self.steps = [number for number, one in enumerate(nuisances) if one.timed == STEP]
         self.grams = self._grams()
         self.Q = np.zeros((len(r), 0))  # orthonormal columns of the nuisances chosen
-        self.periods = False  # whether what repeats over a joint is a candidate
+        self.periods = False  # whether an error that repeats over a joint is a candidate
 
     def part(self, number: int) -> slice:
         """Columns of a nuisance among all."""
@@ -465,7 +465,7 @@ class _Tests:
     def select(self) -> list[_Choice]:
         """Choose nuisances one by one, then exchange each for a better one in the presence of the others.
 
-        Waves over a joint mimic much, so they are candidates where nothing else is found.
+        Waves over a joint mimic much, so they are candidates if nothing else is found.
         """
         chosen = list[_Choice]()
         for self.periods in (False, True):
@@ -507,7 +507,7 @@ class _Tests:
         for _, best, gain in candidates[:_TRIED]:
             if self.chance(best) >= _CHANCE:
                 continue
-            for _, simple, its_gain in candidates:  # to first order a large gear bends as a curve does
+            for _, simple, its_gain in candidates:  # to first order, a large gear bends like a curve
                 fewer = len(self.units[simple.number]) < len(self.units[best.number])
                 if fewer and its_gain >= _AS_MUCH * gain and self.chance(simple) < _CHANCE:
                     return simple
@@ -546,7 +546,7 @@ class ModelCheck:
     errors: tuple[Finding, ...]  # tags that slipped, and those that dominate noise, largest effect first
     effect_px: float  # rms error per marker and view at other poses by all of them
     noise_px: float  # that by noise, with the correlation of the corners of a posture
-    noise_factor: float  # noise_px over that of independent corners
+    noise_factor: float  # noise_px over the noise of independent corners
     recorded_px: float  # rms error at the recorded poses
     unshown: Finding | None  # with the largest effect that the data could not have shown
     bias: FloatArray  # (p, errors) error of the parameters by each of them
@@ -580,7 +580,7 @@ def examine(
     chosen = tests.select()
     found, total, bias = _estimated(tests, effects, chosen)
     slipped, slip_px = _slipped_tags(solution)
-    if len(slipped) > 1:  # several tags do not slip at once, but what carries all of them may move
+    if len(slipped) > 1:  # several tags do not slip at once, but their carrier may move
         detections = solution.problem.detections
         kept, seen = (detections.count_at(mask) for mask in (solution.used, detections.seen))
         lost = 1.0 - kept / np.maximum(seen, 1)
@@ -593,11 +593,11 @@ def examine(
     total = float(np.hypot(total, slip_px))
     factor = np.sqrt(_design(tests, tests.r, T, sigma_px))
     at_recorded = sigma_px * np.sqrt(2.0 * np.square(tests.U).sum() / max(len(tests.r), 1))
-    shown = tests.r_first - tests.r
+    explained = tests.r_first - tests.r
     if total <= factor * independent_px * np.sqrt(share):  # noise hides it
         factor = np.sqrt(_design(tests, tests.r_first, T, sigma_px)) if chosen else factor
-        found, total, bias, shown = [], 0.0, bias[:, :0], np.zeros(1)
-    at_recorded = float(np.hypot(factor * at_recorded, effects.rms(shown)))
+        found, total, bias, explained = [], 0.0, bias[:, :0], np.zeros(1)
+    at_recorded = float(np.hypot(factor * at_recorded, effects.rms(explained)))
     order = sorted(range(len(found)), key=lambda k: -found[k].effect_px)
     noise_px = float(factor * independent_px)
     unshown = effects.unshown({one.number for one in chosen}, sigma_px)
@@ -618,8 +618,10 @@ def suspected(few: Solution) -> list[tuple[str, tuple[int, ...]]]:
     for own in chosen:
         tests.choose([other for other in chosen if other != own])
         better = tests.candidates()
-        least = min((criterion for criterion, one, _ in better if one.number == own.number), default=-np.inf)
-        found += [one for criterion, one, _ in better if criterion < least + _UNDECIDED]
+        min_criterion = min(
+            (criterion for criterion, one, _ in better if one.number == own.number), default=-np.inf
+        )
+        found += [one for criterion, one, _ in better if criterion < min_criterion + _UNDECIDED]
     tests.choose(chosen)
     found += [one for _, one, _ in tests.candidates()]
     nuisances = [tests.nuisances[one.number] for one in found]
@@ -628,7 +630,7 @@ def suspected(few: Solution) -> list[tuple[str, tuple[int, ...]]]:
 
 
 def stepped(solution: Solution, onset: int) -> Finding | None:
-    """Return what moved at a pose, by its row, of a recording that no single fit describes, or None.
+    """Return the part that moved at a pose, by its row, of a recording that no single fit describes, or None.
 
     The part in which all joints move more is fitted; a step explains the other's images as far as it can.
     """
@@ -655,8 +657,8 @@ def stepped(solution: Solution, onset: int) -> Finding | None:
 def _slipped_tags(solution: Solution) -> tuple[list[Finding], float]:
     """Tags that moved on the tool: corners rejected from a pose on, or up to it; and the effect of all, px.
 
-    A corner stays where most of its images show it. One that stays where it was before is off at the end, by
-    as much as its rejected images; the effect is rms over all markers.
+    A corner stays where most of its images show it. A corner that stays where it was before is wrong at the
+    end, by as much as its rejected images; the effect is rms over all markers.
     """
     problem, found, square = solution.problem, list[Finding](), 0.0
     detections, number = problem.detections, problem.detections.marker
@@ -767,7 +769,7 @@ def _described(
     sign = -1.0 if (len(b) == 1 or one.kind == "scale") and (b < 0.0).all() else 1.0
     deviation = float(np.sqrt(max(float(b @ covariance @ b), 0.0))) / length
     size = one.row.size
-    if one.kind == "scale":  # of several joints the root mean square
+    if one.kind == "scale":  # for several joints, the root mean square
         size /= np.sqrt(len(one.joints))
     if one.row.unit == PX:  # px as seen
         size /= tests.weight[-1 if one.view is None else one.view]
@@ -793,20 +795,20 @@ def _finding(
 
 
 def _design(tests: _Tests, r: FloatArray, T: FloatArray, sigma_px: float) -> float:
-    """Variance of predictions with residuals (L,) correlated within postures, over that of independent ones.
+    """Variance of predictions by residuals (L,) correlated within postures, relative to independent ones.
 
     Residuals are adjusted for leverage (R. Bell, D. McCaffrey, "Bias reduction in standard errors for linear
-    regression with multi-stage samples", Survey Methodology 28, 2002). One where it is not significant.
+    regression with multi-stage samples", Survey Methodology 28, 2002). One if it is not significant.
     """
     groups, root = np.repeat(tests.posture, np.diff(tests.edges)), np.linalg.qr(T, mode="r")
     order, count = np.argsort(groups, kind="stable"), int(groups.max()) + 1
-    ends, shown, expected = np.searchsorted(groups[order], np.arange(count + 1)), [], []
+    ends, explained, expected = np.searchsorted(groups[order], np.arange(count + 1)), [], []
     for rows in (order[slice(*pair)] for pair in pairwise(ends.tolist())):
         U = tests.U[rows]
-        shown.append(float(np.square(root @ (U.T @ _adjusted(U, r[rows]))).sum()))
+        explained.append(float(np.square(root @ (U.T @ _adjusted(U, r[rows]))).sum()))
         expected.append(sigma_px**2 * float(np.square(root @ U.T).sum()))
     e = np.array(expected)
-    ratio, noise = sum(shown) / max(e.sum(), 1e-300), np.sqrt(2.0 * (e**2).sum()) / max(e.sum(), 1e-300)
+    ratio, noise = sum(explained) / max(e.sum(), 1e-300), np.sqrt(2.0 * (e**2).sum()) / max(e.sum(), 1e-300)
     return float(ratio) if ratio > 1.0 + _CORRELATED * noise else 1.0
 
 

@@ -57,7 +57,7 @@ class _Uncertainty:
     problem: LeastSquares
     params: Parameters
     errors: Errors  # at a noise of one pixel
-    which: IntArray  # markers assessed; the generators of the screws are those of all
+    which: IntArray  # markers assessed; all markers share the generators of the screws
     region: FloatArray  # (2, 2, 2) lower and upper corners (view, coordinate), px
 
     @classmethod
@@ -134,13 +134,13 @@ class _Uncertainty:
 class _Predictions(NamedTuple):
     """Predicted images of the markers assessed, and their changes by errors of the parameters."""
 
-    there: LeastSquares  # of these images
+    there: LeastSquares  # problem of these images
     inside: BoolArray  # (V, N) whether an image is in the region
     T: FloatArray  # (rows, r) changes of coordinates in the region by independent errors of size one
 
 
 def _needed_spans(uncertainty: _Uncertainty, spreads: list[FloatArray]) -> FloatArray:
-    """Range (n,), rad or m, of a trial about the reference that would determine each weak joint; else NaN."""
+    """Range (n,), rad or m, of a trial about the reference that determines each weak joint; otherwise NaN."""
     needed = np.full(len(spreads), np.nan)
     for i, T in enumerate(spreads):
         low, high = _MIN_REACHES * uncertainty.reach(i), MAX_REACHES * uncertainty.reach(i)
@@ -207,7 +207,7 @@ class _Assessment:
     # expected error of images at random poses and its 99th percentile, px
     error: tuple[float, float]
     check: ModelCheck | None  # deviations from the model; None if it is exact, as in a simulation
-    findings: tuple[Finding, ...]  # its residuals first, then what limits it, the most important first
+    findings: tuple[Finding, ...]  # its residuals first, then its limits in order of importance
 
 
 def assess(
@@ -261,11 +261,11 @@ def _noise_of_joints(
     i = int(np.argmax(noise))
     if noise[i] > UNDETERMINED_NOISE:
         (why,) = weak_joints(np.array([i]), span, needed, detections, np.zeros(len(span)))
-        of, most = Subject(joints=(int(detections.numbers[i]),)), UNDETERMINED_NOISE
-        open_ = Finding("joint_undetermined", REFUSES, of, noise[i], limit=most, unit="1")
+        of, max_count = Subject(joints=(int(detections.numbers[i]),)), UNDETERMINED_NOISE
+        open_ = Finding("joint_undetermined", REFUSES, of, noise[i], limit=max_count, unit="1")
         raise failed([open_, replace(why, severity=REFUSES)], detections.setup)
     weak = noise > WEAK_NOISE
-    if weak.any() and solution.problem.tau is not None:  # by the joints in the data, whatever their noise
+    if weak.any() and solution.problem.tau is not None:  # joints as in the data, whatever their noise
         exact = replace(solution, problem=solution.problem.with_noise(None))
         weak &= np.array([_rms(T) for T in _Uncertainty.of(exact, exact.errors()).at_reach()]) > WEAK_NOISE
     found = weak_joints(np.flatnonzero(weak), span, needed, detections, _span_alone(detections))
@@ -311,17 +311,17 @@ def _shared(outlier: IntArray, detections: Detections) -> tuple[Finding, ...]:
     several = ((1, "markers", detections.marker.size), (0, "poses", detections.pose.size), (2, "views", V))
     for column, kind, count in several:
         values, counts = np.unique(outlier[:, column], return_counts=True)
-        most = int(counts.max(initial=0))
-        if 2 * most > len(outlier) and bdtrc(most - 1, len(outlier), 1.0 / count) < _CHANCE:
+        max_count = int(counts.max(initial=0))
+        if 2 * max_count > len(outlier) and bdtrc(max_count - 1, len(outlier), 1.0 / count) < _CHANCE:
             value = int(values[np.argmax(counts)])
             name: Any = (*detections.view, "all")[value] if kind == "views" else value
             of_kind: dict[str, Any] = {kind: (name,)}
-            return (Finding("outliers", LIMITS, Subject(**of_kind), most, limit=len(outlier), unit="1"),)
+            return (Finding("outliers", LIMITS, Subject(**of_kind), max_count, limit=len(outlier), unit="1"),)
     return ()
 
 
 def _joint_noise(solution: Solution) -> Iterator[Finding]:
-    """Noise of joint readings, if the images show any, and whether it is more than that of pixels."""
+    """Noise of joint readings, if the images show any, and whether it exceeds the pixel noise."""
     noise = solution.joint_noise
     if noise is None or noise.sigma_q == 0.0:
         return

@@ -25,7 +25,7 @@ from projservo_cli.records import BoolArray, FloatArray, IntArray
 MAX_OF_POSE = 50
 # Minimum number of detections of a marker to diagnose it.
 _SEEN = 3
-# Maximum motion of an image whose camera moved, over the spread of its markers, where no other view shows
+# Maximum motion of an image whose camera moved, over the spread of its markers, if no other view shows
 # the joints.
 _SMALL_MOTION = 0.1
 # Minimum number of poses over which a camera settles, and of later ones, whose shifts are by chance.
@@ -42,7 +42,7 @@ class Outliers:
     id_switches: IntArray  # (W, 3) row of the pose, index of the marker as numbered and of the true one
     poses: IntArray  # (P,) rows of poses whose images show other joints than those read
     moved: IntArray  # (V, 2) row of the pose and view of images that a motion of the camera explains
-    shown: IntArray  # (P, 3) row of the pose, view, and row of the pose that its image shows instead
+    mismatched: IntArray  # (P, 3) row of the pose, view, and row of the pose that its image shows instead
     explained: BoolArray  # (V, N) detections that these explain
 
     @classmethod
@@ -58,8 +58,8 @@ class Outliers:
         detections, sigma = problem.detections, solution.sigma_px
         out = detections.seen & ~used
         id_switches, explained = _id_switches(problem, params, out, OUTLIER * sigma)
-        shown = imaged_poses(solution, out & ~explained)
-        for k, view, _ in shown:
+        mismatched = imaged_poses(solution, out & ~explained)
+        for k, view, _ in mismatched:
             explained[view] |= out[view] & (detections.pose_of == k)
         moved = _moved_images(solution, out & ~explained)
         for k, view in moved:
@@ -80,7 +80,7 @@ class Outliers:
                 explained[:, here] |= out[:, here]
                 poses += [] if joints else [int(k)]
         pairs = np.array(suspects, dtype=np.int64).reshape(-1, 2)
-        return cls(pairs, id_switches, np.array(poses, dtype=np.int64), moved, shown, explained)
+        return cls(pairs, id_switches, np.array(poses, dtype=np.int64), moved, mismatched, explained)
 
 
 def _moved_images(solution: Solution, out: BoolArray) -> IntArray:
@@ -120,7 +120,7 @@ def _moved_images(solution: Solution, out: BoolArray) -> IntArray:
 
 
 def _of_cameras(detections: Detections, moved: list[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Images that moved, poses and views, without those of poses at which all cameras did: the arm did.
+    """Images that moved, poses and views, without poses at which all cameras did: there the arm moved.
 
     Over the first poses all cameras may settle.
     """
@@ -139,7 +139,7 @@ def _settling(
     """Poses over which a camera settled, none if it did not.
 
     They begin with the first ones, at which one camera or another moved, of which this one at some. They go
-    on while shifts the same way are larger together than those of later images are by chance.
+    on while shifts the same way are larger together than later shifts are by chance.
 
     residual : (N, 2) of the view, px; out : (N,) rejected; moved : poses and views of small motions.
     """
@@ -216,7 +216,7 @@ def _id_switches(
 
 
 def fits_other_joints(pose: LeastSquares, params: Parameters, q: FloatArray, sigma: float) -> bool:
-    """Whether other joints explain the images of a pose: those of another pose (K, n), or near these."""
+    """Whether other joints explain the images of a pose: joints of another pose (K, n), or near these."""
     poses = [dataclasses.replace(pose, q=np.broadcast_to(at, pose.q.shape), tau=None) for at in q]
     levels = [median_px(one.residual(params), one.detections.seen) for one in poses]
     nearest = poses[int(np.argmin(levels))]
@@ -237,7 +237,7 @@ def rejection_reasons(solution: Solution, kept: BoolArray) -> IntArray:
 
 
 def _wrong_joints(pose: LeastSquares, params: Parameters, sigma: float) -> tuple[int, ...]:
-    """Joint, or else pair of joints, whose correction explains the images of a pose; or none."""
+    """Joint, or pair of joints, whose correction explains the images of a pose; or none."""
     for size in (1, 2):
         pairs = list(itertools.combinations(range(pose.q.shape[1]), size))
         levels = [_corrected_level(pose, params, list(joints), sigma) for joints in pairs]
@@ -249,7 +249,7 @@ def _wrong_joints(pose: LeastSquares, params: Parameters, sigma: float) -> tuple
 def _corrected_level(pose: LeastSquares, params: Parameters, joints: list[int], sigma: float) -> float:
     """Median residual, px, after a robust fit of some joints of a pose to its images.
 
-    The other joints may be off by their noise.
+    The other joints may err by their noise.
     """
     seen, n = pose.detections.seen, pose.q.shape[1]
     others = np.setdiff1d(np.arange(n) if pose.tau is not None else joints, joints)

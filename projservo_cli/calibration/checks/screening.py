@@ -30,7 +30,7 @@ class _Screening(NamedTuple):
 
     observation: Observation
     unseen: IntArray  # numbers of the poses at rest that no camera saw
-    placeholders: int  # number of detections that stood for an unseen marker
+    placeholders: int  # number of detections in place of an unseen marker
     circular: IntArray  # numbers of the joints, from 1, whose readings passed a full turn
     findings: tuple[Finding, ...]
 
@@ -54,7 +54,7 @@ def screened(observation: Observation, joint_types: str) -> _Screening:
     for i, letter in enumerate(joint_types.upper()[: q.shape[1]]):
         if letter == "R" and (turns := _turns(q[:, i])).any():
             low, high = float(q[:, i].min()), float(q[:, i].max())
-            end = math.pi * round(0.5 * (low + high) / math.pi + 1.0) - _DEGREE  # of their convention
+            end = math.pi * round(0.5 * (low + high) / math.pi + 1.0) - _DEGREE  # end of their convention
             q[:, i] += 2.0 * np.pi * turns
             joints.append(i + 1)
             other = end - 2.0 * (math.pi - _DEGREE)
@@ -66,7 +66,7 @@ def screened(observation: Observation, joint_types: str) -> _Screening:
 
 
 def _turns(q: FloatArray) -> FloatArray:
-    """Full turns (K,) to add to readings of a revolute joint, rad, which pass the end of a turn; else zero.
+    """Full turns (K,), rad, to add to readings of a revolute joint that pass the end of a turn.
 
     The readings are cut at the widest gap on the circle. Both ends must be close together around the circle,
     and the gap must be more than half a turn, or than chance leaves among readings spread over their range.
@@ -88,7 +88,7 @@ def _turns(q: FloatArray) -> FloatArray:
 
 
 def without_placeholders(images: FloatArray, marker: IntArray) -> tuple[FloatArray, tuple[Finding, ...]]:
-    """Images (K, V, m, 2) with NaN for numbers that stand for unseen markers, and findings that name them.
+    """Images (K, V, m, 2) with NaN for numbers that mean unseen markers, and findings that name them.
 
     Such a number, as 9999, -1 or 0, repeats exactly over markers and poses: far outside the others or at the
     corner of the image in one coordinate, as one pixel of two markers in an image, or as a subpixel of many.
@@ -105,7 +105,9 @@ def without_placeholders(images: FloatArray, marker: IntArray) -> tuple[FloatArr
         corner &= count > _MORE * np.median(count)
         for value in values[(count >= _REPEATED) & (far | corner)]:
             rows = column == value
-            if rows.sum() < np.isin(track, track[rows]).sum() and np.ptp(image[rows]):  # else it stands still
+            if rows.sum() < np.isin(track, track[rows]).sum() and np.ptp(
+                image[rows]
+            ):  # otherwise it is at rest
                 found[rows, c] = value
     whole = len(seen) == 0 or np.mean(seen == np.rint(seen)) > 0.5
     _, inverse, count = np.unique(seen @ [1.0, 1.0j], return_inverse=True, return_counts=True)
@@ -117,7 +119,8 @@ def without_placeholders(images: FloatArray, marker: IntArray) -> tuple[FloatArr
         if many or (together > 1).sum() > 1:
             found[rows] = seen[rows]
     wrong = np.isfinite(found).any(axis=-1)
-    # A view that shows nothing else shows one spot, which the checks of images refuse by its name.
+    # A view whose every detection is such a number shows one spot, which the checks of images refuse by its
+    # name.
     if not wrong.any() or any(wrong[at[1] == view].all() for view in range(V)):
         return images, ()
     named: dict[str, set[tuple[int, int]]] = {}

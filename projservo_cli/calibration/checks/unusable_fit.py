@@ -41,12 +41,12 @@ _STRAIGHT, _SURE = 0.5, 6.0
 _KEPT = 0.5
 # Minimum number of poses in a row that are nearly all rejected where something changed.
 _WRONG_RUN = 5
-# Joints that are farther than this share of their range from the median have moved; so many poses in which
-# several did are rejected at least where readings are in the wrong order, and this share where no order is.
+# Joints that are farther than this share of their range from the median have moved; number of poses in which
+# several did are rejected at least where readings are in the wrong order, and this share if no order is.
 _MOVED, _WRONG_POSES, _WRONG_SHARE = 0.1, 3, 0.5
-# Maximum share of the other poses that is rejected there, over that of these.
+# Maximum share of the other poses that is rejected there, over the share of these.
 _OTHERS_SHARE = 0.25
-# Maximum noise of such a fit over that of the rig, beyond which no error of it is stated.
+# Maximum noise of such a fit over the noise of the rig, beyond which no error of it is stated.
 _CONTRADICTED_RATIO = 1.5
 # Maximum held-out over predicted error of a fit that rejects much.
 _DOUBTED_ERROR = 1.3
@@ -184,10 +184,10 @@ def _change(rejected: BoolArray, names: Sequence[str]) -> tuple[int, Finding | N
 
 
 def _wrong_order(solution: Solution, rejected: BoolArray) -> Finding | None:
-    """Find poses of several joints that are rejected where those of one are not, or None.
+    """Find poses of several joints that are rejected while poses of one are not, or None.
 
     One joint at a time moves alike whichever column its readings are in: only together they show the order.
-    Where no other order explains these poses, joints err by more than the readings of trials show: one, or
+    If no other order explains these poses, joints err by more than the readings of trials show: one, or
     several.
     rejected : (V, K) views of poses that mostly are.
     """
@@ -215,8 +215,8 @@ def contradiction(
 ) -> Finding | None:
     """Find evidence against a fit that rejects much.
 
-    The noise is that of the images, whatever was given. Of a fit that leaves more than the noise of the rig
-    the rejected detections must agree on no other motion.
+    The noise is taken from the images, whatever was given. Of a fit that leaves more than the noise of the
+    rig the rejected detections must agree on no other motion.
     """
     total = whole.problem.detections.seen.sum()
     gone = float(1.0 - solution.used.sum() / total)

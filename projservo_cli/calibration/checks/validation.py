@@ -36,7 +36,7 @@ from projservo_cli.records import (
 _MIN_FOLDS = 2
 # Divisions of the poses into blocks besides a random one, and the cause of a larger error there.
 _BLOCKS = "posture", "time"
-# Held-out over predicted error in blocks, over that of random parts, from which it is named.
+# Held-out over predicted error in blocks, over the ratio of random parts, from which it is named.
 _BLOCK_RATIO = 1.3
 # Held-out error of the other views with a camera over that without, from which it spoils them.
 _SPOILS = 1.1
@@ -45,7 +45,7 @@ _MIN_READINGS = 4
 _OPEN = Finding("poses_open", REFUSES)
 # Median held-out error, in the stated error and the noise of the images together, from which it contradicts.
 _CONTRADICTED = 3.0
-# Variance of a median of normal numbers over that of their mean.
+# Variance of a median of normal numbers over the variance of their mean.
 _MEDIAN = 0.5 * np.pi
 # Median length of a normal error in the plane over its rms.
 _MEDIAN_LENGTH = float(np.sqrt(np.log(2.0)))
@@ -139,7 +139,7 @@ def _of_others(
 ) -> FloatArray:
     """Held-out rms (2,) of the other views, px, by fits with a view and without it; NaN if there is none.
 
-    residual : (K, V, m, 2) of the fits with all views; both count where both predict.
+    residual : (K, V, m, 2) of the fits with all views; both count if both predict.
     """
     whole, keep = solution.problem.detections, [u for u in range(len(residual[0])) if u != v]
     some = whole.of_views(keep)
@@ -157,7 +157,7 @@ def _of_others(
 
 
 def _on_others(view: tuple[str, ...], others: FloatArray) -> Iterator[Finding]:
-    """Name the camera without which the others (V, 2) are predicted best, or tell that none spoils them."""
+    """Name the camera without which the others (V, 2) are predicted best, or say that none spoils them."""
     if not np.isfinite(others).any():
         return
     gain = others[:, 0] / others[:, 1]
@@ -363,7 +363,7 @@ def comparable(calibration: Calibration, observation: Observation) -> tuple[Obse
 
 
 def median_limit(found: Mapping[str, Any]) -> Finding:
-    """Return the limit of the median of residuals, and what that is of, by their statistics."""
+    """Return the limit of the median of residuals, and the limited quantity, by their statistics."""
     errors = Finding("errors", amount=found["stated_px"], limit=found["noise_px"], unit="px")
     parts = errors, Finding("factor", amount=_CONTRADICTED)
     return Finding(
@@ -418,7 +418,7 @@ def of_views(observation: Observation, names: tuple[str, ...]) -> Observation:
         return observation
     if missing := [name for name in names if name not in observation.view]:
         raise InputError(
-            f"the images are of {', '.join(observation.view)}, and those of the calibration of "
+            f"the images are of {', '.join(observation.view)}, and the calibration has "
             f"{', '.join(names)}: add {', '.join(missing)}, or calibrate without"
         )
     which = [observation.view.index(name) for name in names]
@@ -432,7 +432,7 @@ def of_views(observation: Observation, names: tuple[str, ...]) -> Observation:
 def _image_noise(calibration: Calibration, observation: Observation) -> float:
     """Euclidean noise of the pixels of an observation, px, by its own epipolar geometry.
 
-    That of the calibration where few markers were seen by both cameras, or without parallax.
+    That of the calibration if few markers were seen by both cameras, or without parallax.
     """
     detections = Detections.of(observation, calibration.joint_types)
     if calibration.lens is not None:

@@ -72,8 +72,8 @@ class ImageGeometry(ABC):
     core: "Core"  # the same noise, robust against many wrong correspondences, and its interval
     min_px: float  # noise below which images are exact
 
-    origin: ClassVar[str]  # of the noise: views, or body
-    shown: ClassVar[str]  # who shows it, for messages
+    origin: ClassVar[str]  # origin of the noise: views, or body
+    evidence: ClassVar[str]  # who shows it, for messages
 
     @property
     def noise_px(self) -> float:
@@ -108,11 +108,11 @@ class Epipolar(ImageGeometry):
     inlier: BoolArray  # (N,) whether a correspondence used agrees with F
     parallax_px: float  # median distance of the second view from a homography of the first
 
-    origin, shown = "views", "both views show"
+    origin, evidence = "views", "both views show"
 
     @classmethod
     def of(cls, detections: Detections, rng: np.random.Generator) -> "Epipolar":
-        """Estimate the geometry as ``fitted`` does; raises WorkFailed also where it shows no depth."""
+        """Estimate the geometry as ``fitted`` does; raises WorkFailed also if it shows no depth."""
         found = cls.fitted(detections, rng)
         if found.parallax_px < _MIN_PARALLAX * found.sigma_px:
             raise WorkFailed(
@@ -182,7 +182,7 @@ class Epipolar(ImageGeometry):
     def guesses(
         self, detections: Detections, frame: "ImageFrame", factor: float
     ) -> list[tuple[FloatArray, FloatArray]]:
-        """Cameras and points by ``metric_guesses``, NaN where one view alone sees a marker."""
+        """Cameras and points by ``metric_guesses``, NaN if one view alone sees a marker."""
         found = []
         for P, points in metric_guesses(self, detections, frame, factor):
             known = np.full((detections.pose_of.size, 3), np.nan)
@@ -334,7 +334,7 @@ class ImageFrame:
 
     @classmethod
     def of(cls, detections: Detections, image_size: ImageSize | None) -> "ImageFrame":
-        """Frame of widths and heights, px, else of the extent of the data in each view."""
+        """Frame of widths and heights, px, otherwise of the extent of the data in each view."""
         if image_size is not None:
             sizes = image_sizes(image_size, detections.view)
             return cls(0.5 * sizes, sizes.max(axis=1), True)
@@ -426,7 +426,7 @@ def _ray_depths(R: FloatArray, t: FloatArray, x: FloatArray, y: FloatArray) -> t
 
 
 def _compared(detections: Detections) -> tuple[Detections, tuple[IntArray, IntArray, IntArray]]:
-    """Detections at evenly spaced poses, and their pairs of markers; all where a pair is not seen again."""
+    """Detections at evenly spaced poses, and their pairs of markers; all if a pair is not seen again."""
     K = len(detections.q)
     some = detections.of_poses(np.isin(np.arange(K), even_choice(K, _COMPARED)))
     if some.both.any():

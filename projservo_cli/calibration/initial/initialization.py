@@ -261,7 +261,7 @@ def _chain(w: FloatArray, q: FloatArray, prismatic: BoolArray) -> FloatArray:
 def _fit_axes(
     w: FloatArray, R: FloatArray, q: FloatArray, prismatic: BoolArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Axes (S, n, 3) and losses (S,) beside some: Cauchy loss on log(R R_predᵀ), all starts at once."""
+    """Axes (S, n, 3) and losses (S,) near given ones: Cauchy loss on log(R R_predᵀ), all starts at once."""
     S, n = w.shape[:2]
     away = np.swapaxes(_chain(w, q, prismatic)[:, n], -1, -2) @ R
     base = np.stack([Rotation.from_matrix(rotations).mean().as_matrix() for rotations in away])
@@ -368,7 +368,7 @@ def _robust_solve(
 
 
 class GuessedBody(NamedTuple):
-    """Cameras and placed points by a guess, and the body that these are of, whatever the joints read."""
+    """Cameras and placed points by a guess, and their body, whatever the joints read."""
 
     P: FloatArray  # (V, 3, 4)
     placed: BoolArray  # (N,) observations that have a point
@@ -397,7 +397,7 @@ def starts(
 ) -> Iterator[Parameters]:
     """Yield initial parameters, most promising first: factors of the best focal lengths, and axes for each.
 
-    detections : those of the problem, or of some of its poses; known : bodies that their images show.
+    detections : of the problem, or of some of its poses; known : bodies that their images show.
     Raises WorkFailed if no three markers are seen together.
     """
     for factor in factors:
@@ -508,7 +508,7 @@ class Nominal:
         own, letters = self.joint_types, letters_of(detections.prismatic)
         if own != letters:
             raise InputError(
-                f"{self.where}: its joints are {own}, those of the data {letters}; "
+                f"{self.where}: its joints are {own}, the data have {letters}; "
                 "give one screw a joint, or leave calibration.init out"
             )
         missing = np.setdiff1d(detections.marker, self.marker)

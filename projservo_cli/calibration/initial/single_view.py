@@ -1,4 +1,4 @@
-"""One view: the tool as a rigid body that moves freely before a camera, whatever the joints say.
+"""One view: the tool as a rigid body that moves freely before a camera, without joint readings.
 
 It starts a calibration by one camera, and shows the noise of its images, as the epipolar geometry does
 for two. A small body is nearly seen by scaled orthography: a factorisation gives its shape and its turns up
@@ -87,7 +87,7 @@ class _Body(NamedTuple):
     X: FloatArray  # (m, 3)
     focal: FloatArray  # (2,) of u and v, px
     middle: FloatArray  # (2,) px
-    cost: float  # of the fit
+    cost: float  # cost of the fit
     residual: FloatArray  # (N, 2) px, weighted
 
     @property
@@ -335,13 +335,15 @@ def _reversed(body: _Body, focals: FloatArray) -> list[_Start]:
     return [_Start(R, body.t * [1.0, 1.0, focal / unit], X, focal) for focal in focals.tolist()]
 
 
-def _flat_starts(images: FloatArray, focals: FloatArray, middle: FloatArray, most: float) -> list[_Start]:
+def _flat_starts(
+    images: FloatArray, focals: FloatArray, middle: FloatArray, max_distance: float
+) -> list[_Start]:
     """Starts of a flat body, empty if it is not flat: of the likeliest planes at each focal length, px.
 
     Homographies from one image to the others, [HZ04] 4.1, show any plane; in metric coordinates of the right
     plane the first two columns of each are orthogonal and of equal length, Z. Zhang, PAMI 22(11), 2000.
 
-    most : distance from a homography, over the extent of the markers in the image, of a flat body.
+    max_distance : distance from a homography, over the extent of the markers in the image, of a flat body.
     """
     seen = np.isfinite(images[..., 0])
     across = [np.linalg.svd(x[k] - x[k].mean(axis=0))[1] for x, k in zip(images, seen, strict=True)]
@@ -355,9 +357,9 @@ def _flat_starts(images: FloatArray, focals: FloatArray, middle: FloatArray, mos
         moved = homogeneous(images[first, both]) @ H[k].T
         left = moved[:, :2] / moved[:, 2:] - images[k, both]
         off[k] = np.median(np.linalg.norm(left, axis=1)) / max(float(extent[k]), 1e-9)
-    if others.size < _LEAST_POSES or float(np.median(off[others])) > most:
+    if others.size < _LEAST_POSES or float(np.median(off[others])) > max_distance:
         return []
-    near, starts = np.isfinite(off) & (off <= 4.0 * most), list[_Start]()
+    near, starts = np.isfinite(off) & (off <= 4.0 * max_distance), list[_Start]()
     center = homogeneous(images[first, seen[first]].mean(axis=0)[None])[0]
     for focal in focals.tolist():
         camera = np.array([[focal, 0.0, middle[0]], [0.0, focal, middle[1]], [0.0, 0.0, 1.0]])
@@ -396,10 +398,10 @@ def _flat_start(
     G = np.where(known[:, None, None], np.linalg.solve(camera, H @ camera) @ plane, plane)
     back = np.linalg.inv(camera @ G)
     on_plane = homogeneous(images.reshape(-1, 2)).reshape(*images.shape[:2], 3) @ back.swapaxes(1, 2)
-    places = np.where((seen & known[:, None])[..., None], on_plane[..., :2] / on_plane[..., 2:], np.nan)
+    positions = np.where((seen & known[:, None])[..., None], on_plane[..., :2] / on_plane[..., 2:], np.nan)
     X = np.zeros((images.shape[1], 3))
-    some = np.isfinite(places[..., 0]).any(axis=0)
-    X[some, :2] = np.nanmedian(places[:, some], axis=0)
+    some = np.isfinite(positions[..., 0]).any(axis=0)
+    X[some, :2] = np.nanmedian(positions[:, some], axis=0)
     size = np.linalg.norm(G[..., :2], axis=1).mean(axis=1)
     G = G / size[:, None, None] * np.sign(G[:, 2, 2])[:, None, None]
     U, _, Vt = np.linalg.svd(G[..., :2], full_matrices=False)

@@ -1,6 +1,6 @@
 """Triangulation of each marker where cameras and joints are known: its place by consensus, and its inliers.
 
-A marker has three unknowns and its observations nothing else in common, so the cost is linear in the number
+A marker has three unknowns and its observations share no more, so the cost is linear in the number
 of observations, whatever share of them is wrong.
 """
 
@@ -27,9 +27,9 @@ _TAIL = 5e-4
 _TAIL_AT_END = 1e-2
 # Maximum number of rounds of tests.
 _ROUNDS = 7
-# Excess over that of the worst misfit of a marker from which misfits are rejected together.
+# Excess over the worst misfit of a marker from which misfits are rejected together.
 _WORST = 0.25
-# Maximum residual, px, which also stands for a point without image.
+# Maximum residual, px, which also replaces a point without image.
 _FAR = 1e6
 # Approximate number of observations processed together.
 _AT_ONCE = 2**15
@@ -69,14 +69,14 @@ class Tracks:
         """Move the wanted markers (m,) to where most of their detections agree within a noise σ, px.
 
         Candidates are the current point, and those triangulated from observations by both views, or from
-        two poses where there is one view.
+        two poses if there is one view.
         """
         detections, M = self.detections, self.params.M[:, :3].copy()
         rows = np.flatnonzero(wanted[detections.marker_of])
         best = np.full(len(M), np.inf)
         for number in range(-1, _CANDIDATES):
             points = self._triangulate(max(number, 0), wanted)
-            if number < 0:  # the current point, else the median of all
+            if number < 0:  # the current point, otherwise the median of all
                 points = np.where(np.isfinite(M), M, np.nanmedian(np.concatenate([M, points]), axis=0))
             for part, some, marker in self._parts(rows):
                 there, loss = self._refine(points[some], part, marker, sigma)
@@ -179,7 +179,7 @@ class Tracks:
             tail = np.where(at_end, _TAIL_AT_END, _TAIL)
             limits = chdtri(2, tail), chdtri(4, tail.min(axis=0))
             excess = np.maximum(one / limits[0], two / limits[1]) * seen
-            # If both views together do not fit, reject the view that does not, else both.
+            # If both views together do not fit, reject the view that does not, otherwise both.
             alone = one > limits[0]
             fits = seen & np.where((two > limits[1]) & ~alone.any(axis=0), False, ~alone)
             worst = np.zeros(len(M))

@@ -1,7 +1,7 @@
-"""Figures after those of [RH00]: named arrays from a run, and a drawing of them.
+"""Figures after [RH00]: named arrays from a run, and a drawing of them.
 
 A figure is a pair of functions ``data(material) -> arrays`` and ``draw(data, figure)``, which registers it
-in a file of this folder with those of its topic. Some are drawn of a single result too, whoever made it.
+in a file of this folder with others of its topic. Some are also drawn from a single result.
 """
 
 from importlib import import_module

@@ -89,10 +89,10 @@ def _data(fit: Fit) -> Data:
 def _as_tested(fit: Fit, residual: FloatArray, used: BoolArray) -> tuple[FloatArray, FloatArray]:
     """Residuals (K, 2, m, 2), px, that are to scatter as the noise model, and the variance of predictions.
 
-    Those of a pose, weighed where their deviations are stated, have the covariance S = σ² (I + G Gᵀ), with G
+    Those of a pose, weighed if their deviations are stated, have the covariance S = σ² (I + G Gᵀ), with G
     the derivative by the joints times their noise over σ. With G = U s Vᵀ, σ S^-½ takes the share
     1 − (1 + s²)^-½ from the part along U. It mixes the separate errors of markers: of the squares
-    of what comes to one of them from the others, only their sum A over all is needed.
+    of their mutual contributions, only their sum A over all is needed.
     """
     calibration, q = fit.calibration, fit.observation.q
     weight = np.ones(used.shape)
@@ -110,7 +110,7 @@ def _as_tested(fit: Fit, residual: FloatArray, used: BoolArray) -> tuple[FloatAr
         )
         common, own = (part[0] * weight[k, ..., None, None] for part in parts)
         variance[k] = (common**2).sum(axis=-1) + (own**2).sum(axis=-1)
-        if not of_pose.any():  # of a pose that is left out nothing is tested
+        if not of_pose.any():  # a pose that is left out is not tested
             continue
         U, s, _ = np.linalg.svd(G[k][of_pose].reshape(-1, len(q[k])), full_matrices=False)
         rows = np.concatenate([tested[k][..., None], common], axis=-1)[of_pose].reshape(len(U), -1)
@@ -152,7 +152,7 @@ def observed_pixels(calibration: Calibration, observation: Observation) -> tuple
 
 
 def _columns(calibration: Calibration, observation: Observation) -> list[int]:
-    """Index of each calibrated marker among those of an observation."""
+    """Index of each calibrated marker among the markers of an observation."""
     place = {number: j for j, number in enumerate(observation.marker.tolist())}
     return [place[number] for number in calibration.marker.tolist()]
 
@@ -184,7 +184,7 @@ def _information(calibration: Calibration) -> FloatArray:
 
 
 def _expected_residual(predicted: FloatArray, sigma: float) -> FloatArray:
-    """Rms residual (L,) that a fit leaves where its own prediction errs by so much, px per coordinate.
+    """Rms residual (L,) that a fit leaves if its own prediction errs by ``predicted``, px per coordinate.
 
     A least-squares residual is noise less the error of the fitted prediction, which it follows:
     variance σ² − p²; D. A. Belsley, E. Kuh, R. E. Welsch, "Regression Diagnostics", 1980, section 2.1.
@@ -275,7 +275,7 @@ def _poses(axes: "style.Axes", data: Data) -> None:
 
 
 def _excitation(axes: "style.Axes", data: Data) -> None:
-    """Range of each joint, deg, or m where all are prismatic; beside revolute ones these say their range."""
+    """Range of each joint, deg, or m if all are prismatic; next to revolute ones these state their range."""
     prismatic, weak = data["prismatic"], data["weak"]
     mixed, amount = bool(prismatic.any() and not prismatic.all()), data["excitation"].copy()
     amount[~prismatic] = np.degrees(amount[~prismatic])

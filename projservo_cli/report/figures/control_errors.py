@@ -19,7 +19,7 @@ from projservo_cli.report.figure_inputs import (
 )
 from projservo_cli.task.face import cyclic_order
 
-_DECADES = 1e-5  # of its start, down to which an error is drawn on a logarithmic scale
+_DECADES = 1e-5  # share of its start, down to which an error is drawn on a log scale
 _FAINT: style.LineStyle = {"linewidth": 0.8, "alpha": 0.55, "label": ""}
 _KERNEL = r"$\tau$, unit-norm kernel (8), "
 _TRANSLATION = {
@@ -123,7 +123,7 @@ def _data_three(report_data: ReportData) -> Data:
     "Euclidean model, and the differences between both.",
 )
 def _draw_three(data: Data, figure: "style.Figure") -> None:
-    """Above τ and what separates it from the truth, below the angles and their differences."""
+    """Above τ and its difference from the truth, below the angles and their differences."""
     (translation, off), (rotation, difference) = figure.subplots(2, 2, sharex=True)
     t, t_metric = data["t_s"], data["t_s_metric"]
     for name, line in _TRANSLATION.items():
@@ -154,8 +154,8 @@ def _rotations(rotation: "style.Axes", difference: "style.Axes", data: Data) -> 
         rotation.plot(t_metric, data[f"{name}_deg_metric"], **euclidean)
         for kind, width in (("calibrated", None), ("true", _THIN)):
             curve = data[f"{name}_difference_deg_{kind}"]
-            shown = style.positive(curve)
-            difference.plot(t_common[: len(curve)], shown, **style.line(color, width=width))
+            positive_values = style.positive(curve)
+            difference.plot(t_common[: len(curve)], positive_values, **style.line(color, width=width))
 
 
 def _enlarge(axes: "style.Axes", t: FloatArray, steps: FloatArray, chosen: list[int]) -> None:
@@ -241,7 +241,7 @@ def _data_runs(report_data: Driven) -> Data:
 
 
 def _of_other_laws(report_data: Driven | ReportData) -> bool:
-    """Whether runs are of laws that are not in the paper; those of a sequence have a figure of their own."""
+    """Whether runs are of laws that are not in the paper; laws of a sequence have a separate figure."""
     others = {*moved(report_data)} - {*PAPER_LAWS}
     return bool(others) and not any("/" in name for name in others)
 
@@ -256,7 +256,7 @@ def _of_other_laws(report_data: Driven | ReportData) -> bool:
     "convergence, the joints and the commanded joint velocities over time.",
 )
 def _draw_runs(data: Data, figure: "style.Figure") -> None:
-    """Two rows a run: above the images, below its curves over time."""
+    """Two rows per run: above the images, below its curves over time."""
     runs, names, slides = [str(name) for name in data["run"]], data["view"], data["prismatic"]
     figure.set_figheight(4.4 * len(runs) + 0.5)
     rows = panels.rows(figure, [len(names), 3] * len(runs))

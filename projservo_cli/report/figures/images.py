@@ -14,7 +14,7 @@ from projservo_cli.report import panels, style
 from projservo_cli.report.figure_inputs import DIRECT, Data, Driven, ReportData, percent, registered, title
 from projservo_cli.task.face import cyclic_order
 
-# Classical laws of the paper; those of others are among every run.
+# Classical laws of the paper; other laws are among every run.
 _CLASSICAL = tuple(law for law in PAPER_LAWS if law in CLASSICAL_LAWS)
 _PANELS_WIDTH, _PANEL_WIDTH = 5.8, 3.6  # inches, of all panels side by side, and of one at most
 _PATH = style.line(style.BLACK, width=0.9, label="path of a marker")
@@ -23,7 +23,7 @@ _STOPPED = style.dots(style.BLACK, "x", "end of the run", markersize=4)
 
 
 def _data_classical(report_data: ReportData) -> Data:
-    """Image paths of the classical laws that were run, with their hidden and standing stretches."""
+    """Image paths of the classical laws that were run, with their hidden and stationary stretches."""
     result: Data = {"image_size": report_data.plant.image_size}
     order = report_data.plant.order
     for law in _CLASSICAL:
@@ -56,7 +56,7 @@ def _panel_width(views: int) -> float:
     "stands still.",
 )
 def _draw_classical(data: Data, figure: "style.Figure") -> None:
-    """One row a law, one column a camera."""
+    """One row per law, one column per camera."""
     laws, size = [law for law in _CLASSICAL if f"s_{law}" in data], data["image_size"]
     names = data["view"]
     drawn = [np.concatenate([data[f"s_{law}"], data[f"s_star_{law}"][None]]) for law in laws]
@@ -210,8 +210,8 @@ def _data_overview(report_data: ReportData) -> Data:
 def _draw_overview(data: Data, figure: "style.Figure") -> None:
     """Left the images of the cameras, right the errors."""
     names = data["view"]
-    shown = ("s_star", "center", *(f"s_{law}" for law in _OVERVIEW_LAWS))
-    pixels = np.concatenate([data[name].reshape(-1, 2) for name in shown])
+    drawn_parts = ("s_star", "center", *(f"s_{law}" for law in _OVERVIEW_LAWS))
+    pixels = np.concatenate([data[name].reshape(-1, 2) for name in drawn_parts])
     aspect, rows = style.aspect(pixels, *_ASPECTS), max(2, len(names))
     figure.set_figheight(rows * _IMAGE_WIDTH * aspect + 1.75 + 0.6 * (rows - 2) + _LEGEND_ROOM / 72.0)
     grid = figure.add_gridspec(rows, 2, width_ratios=(_IMAGE_WIDTH, _ERRORS_WIDTH))
@@ -277,19 +277,19 @@ def frames_of_run(
     ends = np.cumsum(kept.frame_size).reshape(kept.frame_size.shape)
     films = []
     for ends_of_view, sizes in zip(ends.T, kept.frame_size.T, strict=True):
-        film = []
+        grey_frames = []
         for k in np.arange(len(sizes)) if selected is None else selected:
             end, size = ends_of_view[k], sizes[k]
             image = Image.open(io.BytesIO(kept.frame_jpeg[end - size : end].tobytes()), formats=["JPEG"])
             if width is not None and image.width > width:
                 image.draft("L", (width, width * image.height // image.width))
-            film.append(np.asarray(image.convert("L")))
-        films.append(np.array(film))
+            grey_frames.append(np.asarray(image.convert("L")))
+        films.append(np.array(grey_frames))
     return films
 
 
 def _runs_with(report_data: Driven | ReportData, part: str) -> list[tuple[str, Trace]]:
-    """Names and traces of the runs that have a part, first those of the direct laws."""
+    """Names and traces of the runs that have a part, first the direct laws."""
     runs = [run for run in report_data.traces.items() if getattr(run[1], part) is not None]
     return sorted(runs, key=lambda run: run[0] not in PROJECTIVE_LAWS)
 
@@ -319,7 +319,7 @@ def _data_frames(report_data: Driven | ReportData) -> Data:
         "s": trace.s[:, :, order],
         "s_star": trace.s_star[:, order],
         **_feature_images(trace.of_incidences, kept.frame_index[selected]),
-        **{f"frames_{view}": film for view, film in enumerate(frames)},
+        **{f"frames_{view}": grey_frames for view, grey_frames in enumerate(frames)},
         "view": np.array(trace.view),
     }
 
@@ -339,10 +339,10 @@ def with_halo(axes: "style.Axes") -> None:
     _data_frames,
     shows=(_filmed, "the robot shows no frames"),
     alt="A row for each camera, with its image at the start, in the middle and at the end. Drawn over "
-    "them are the markers that were found, the face with the paths of its markers so far, and the goal.",
+    "them are the markers that were found, the face with the past paths of its markers, and the goal.",
 )
 def _draw_frames(data: Data, figure: "style.Figure") -> None:
-    """A row a camera, a column a moment."""
+    """A row per camera, a column per moment."""
     names = data["view"]
     sizes = np.array([data[f"frames_{view}"].shape[1:] for view in range(len(names))])
     heights = style.WIDTH / 3.0 * sizes[:, 0] / sizes[:, 1]
@@ -369,7 +369,7 @@ def _draw_frames(data: Data, figure: "style.Figure") -> None:
 
 
 _LEAST_PX = 1e-3  # lowest error that is drawn
-_ARROW = 0.06  # of free motions, over the size of what is drawn
+_ARROW = 0.06  # arrow of free motions, over the size of the drawing
 _FREE = style.line(style.PURPLE, width=1.4)
 _TITLES = 84  # characters of all titles in a row
 _ERRORS_HEIGHT = 3.2  # inches, of the panels of errors with titles and legend
@@ -377,27 +377,27 @@ _LEAST_ASPECT = 0.55  # height over width of an image of features
 _PANELS = 4  # most panels of errors in a row
 
 
-def _feature_images(found: IncidenceHistory | None, instants: IntArray) -> Data:
-    """Images of the features of the tool at instants (k,) and of those of the scene; none for a pose."""
+def _feature_images(found: IncidenceHistory | None, samples: IntArray) -> Data:
+    """Images of the features of the tool at instants (k,) and of features of the scene; none for a pose."""
     if found is None:
         return {}
-    return {"feature": found.feature_s[instants], "feature_there": found.feature_s_star}
+    return {"feature": found.feature_s[samples], "feature_there": found.feature_s_star}
 
 
 def _data_incidences(report_data: ReportData | Driven) -> Data:
     """Images of features at both ends of a run, and the error of each incidence over time in all runs.
 
-    Motions of a sequence have incidences of their own: what a run does not ask for is NaN.
+    Motions of a sequence have separate incidences: those of other runs are NaN.
     """
-    name, shown = _runs_with(report_data, "of_incidences")[0]
-    there = shown.of_incidences
+    name, drawn_parts = _runs_with(report_data, "of_incidences")[0]
+    there = drawn_parts.of_incidences
     assert there is not None
     result: Data = {
         "run": np.array(title(name)),
         "free_dof": np.array(-1 if there.free_dof is None else there.free_dof),
-        "face": shown.s[[0, -1]][:, :, cyclic_order(report_data.plan.A)],
-        "face_at_end": shown.s[-1],
-        "view": np.array(shown.view),
+        "face": drawn_parts.s[[0, -1]][:, :, cyclic_order(report_data.plan.A)],
+        "face_at_end": drawn_parts.s[-1],
+        "view": np.array(drawn_parts.view),
         **_feature_images(there, np.array([0, -1])),
         **{key: free for key in ("free_motion", "free_s") if (free := getattr(there, key)) is not None},
     }
@@ -427,15 +427,21 @@ def _of_features(report_data: Driven | ReportData) -> bool:
     "not in the paper",
     _data_incidences,
     shows=(_of_features, "the goal is a whole pose"),
-    alt="Above, for each camera: the features of the tool at the start and at the end of a run, those of the "
+    alt="Above, for each camera: the features of the tool at the start and end of a run, features of the "
     "scene, and how the motions that are left free move the face. Below, for each incidence: its error over "
     "time on a logarithmic scale, a curve for each run.",
 )
 def _draw_incidences(data: Data, figure: "style.Figure") -> None:
     """Above a panel for each camera, below one for each incidence with a curve for each run."""
     names, count, free = data["view"], len(data["incidence"]), int(data["free_dof"])
-    shown = [data["face"], np.moveaxis(data["feature"], 3, 1), np.moveaxis(data["feature_there"], 2, 0)[None]]
-    pixels = [np.concatenate([part[:, view].reshape(-1, 2) for part in shown]) for view in range(len(names))]
+    drawn_parts = [
+        data["face"],
+        np.moveaxis(data["feature"], 3, 1),
+        np.moveaxis(data["feature_there"], 2, 0)[None],
+    ]
+    pixels = [
+        np.concatenate([part[:, view].reshape(-1, 2) for part in drawn_parts]) for view in range(len(names))
+    ]
     height = _panel_width(len(names)) * style.aspect(np.concatenate(pixels), _LEAST_ASPECT)
     rows = math.ceil(count / _PANELS)
     across = math.ceil(count / rows)
@@ -491,9 +497,9 @@ def _within(data: Data, k: int) -> str:
 def _draw_free(panel: "style.Axes", data: Data, view: int, length: float) -> None:
     """Draw at the corners of the face at the end how free motions move them, the farthest by a length, px."""
     for i, moved in enumerate(data.get("free_s", ())):
-        face, way = data["face_at_end"][view], moved[view]
-        way = way * length / max(float(np.linalg.norm(way, axis=1).max()), 1e-9)
-        ends = np.stack([face - way, face + way], axis=1)
+        face, arrow = data["face_at_end"][view], moved[view]
+        arrow = arrow * length / max(float(np.linalg.norm(arrow, axis=1).max()), 1e-9)
+        ends = np.stack([face - arrow, face + arrow], axis=1)
         panel.plot(*style.outlines(ends).T, **_FREE | ({} if i else {"label": "free motions"}))
 
 
@@ -583,8 +589,10 @@ def _draw_object(data: Data, figure: "style.Figure") -> None:
         for panel, taught, now, face in zip(row, *images, strict=True):
             moved = np.stack([taught, now], axis=1)
             panel.plot(*style.outlines(moved[np.isfinite(moved).all(axis=(1, 2))]).T, **_MOVED)
-            for shown, line in ((taught, _TAUGHT), (now, _NOW)):
-                each = [style.outlines(shown[None, tags == tag]) for tag in dict.fromkeys(tags.tolist())]
+            for drawn_parts, line in ((taught, _TAUGHT), (now, _NOW)):
+                each = [
+                    style.outlines(drawn_parts[None, tags == tag]) for tag in dict.fromkeys(tags.tolist())
+                ]
                 panel.plot(*np.concatenate(each).T, **line)
             style.face(panel, face, _CARRIED)
         panels.cameras(row, names, name if len(rows) > 1 else "")

@@ -11,13 +11,13 @@ from projservo_cli.records import FloatArray, Plan
 from projservo_cli.report import panels, style
 from projservo_cli.report.figure_inputs import Data, ReportData, joint_kinds, joint_units, registered
 
-PIECES = 4  # of each edge of a tree, which is no straight line in an image
+PIECES = 4  # pieces of each edge of a tree, which is curved in an image
 _IMAGES_WIDTH, _ROW = 5.8, 1.5  # inches: of all images, and the height of a row of curves
 _HIGHEST = 0.8  # height of an image over its width, at most
-_STRIP = 0.085  # of the time, that the range of a joint takes next to the curves
+_STRIP = 0.085  # share of the time axis for the range of a joint next to the curves
 _NEAR, _NEAR_PX = 1.0, 10.0  # margins and distances up to which a scale to ten times as much is linear
 _SUBSCRIPTS = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")  # as text, which takes a tenth of formulas
-# Dashes of what each camera has; dotted is what is required.
+# Dashes of each camera; dotted lines are required values.
 _SIDES: tuple[Any, ...] = (style.SOLID, (0, (4, 1.5)), style.DASH_DOTTED, (0, (3, 1, 1, 1, 1, 1)))
 _CENTER = style.line(style.GREEN, width=1.6, label="path of the centre")
 _CORNER = style.dots(style.VERMILION, "|", "a rounded corner begins, ends", markersize=8.0)
@@ -81,13 +81,13 @@ def _data(report_data: ReportData) -> Data:
 
 
 def _distances(plan: Plan, border_px: float) -> Data:
-    """Return distances in px and their required values; of a joint-space path those of its constraints."""
+    """Return distances in px and their required values; for a joint-space path, of its constraints."""
     search = plan.search
     if search is None or search.margins is None or search.required_margins is None:
         distance = np.where(plan.border_distance > BEHIND, plan.border_distance, np.nan)
         return {"border_px": distance, "border_px_asked": np.full_like(distance, border_px)}
     distances: Data = {}
-    views = len(plan.view)  # four margins have each view, between those of the joints and of regions
+    views = len(plan.view)  # four margins have each view, between margins of the joints and of regions
     width, border, clear = (np.arange(k, k + views) for k in (1 + 2 * views, 1 + 3 * views, 1 + 4 * views))
     for name, columns in (("border_px", border), ("width_px", width), ("clear_px", clear[:1])):
         if np.isfinite(search.margins[:, columns[0]]).all():

@@ -21,7 +21,7 @@ from projservo_cli.report.figure_inputs import (
 )
 
 _PATH_POINTS = 400
-_WHIRL = np.pi  # with a longer joint step, rad or m, the arm winds up: its path is drawn at the instants only
+_WHIRL = np.pi  # joint step, rad or m, above which the arm winds up: its path is drawn at the instants only
 _WIDE = 10.0  # modes that differ more have a logarithmic scale, down to a fraction of the smallest
 _LEAST_SHOWN = 0.02
 _RESOLUTION = np.radians(1.0)  # longest joint motion, rad or m, between two points of a drawn path
@@ -108,7 +108,7 @@ def _center_path(report_data: ReportData, trace: Trace) -> FloatArray:
     "operators, with and without a limit.",
 )
 def _draw(data: Data, figure: "style.Figure") -> None:
-    """One row a law: left the paths, right the largest deviation over the gain."""
+    """One row per law: left the paths, right the largest deviation over the gain."""
     gains, limit = data["gain"], f"{float(data['step_limit_deg']):g}° per step"
     lines = [
         *(style.curve(i, f"gain {gain:g} per step") for i, gain in enumerate(gains)),
@@ -192,7 +192,7 @@ def _draw_modes(data: Data, figure: "style.Figure") -> None:
 def _paths(
     axes: "style.Axes", paths: Sequence[FloatArray], lines: Sequence[style.LineStyle], *, wide: bool
 ) -> None:
-    """Draw distances from the straight line over the way along it, of paths (k, 2), mm.
+    """Draw distances from the straight line over the distance along it, of paths (k, 2), mm.
 
     wide : on a logarithmic scale, which has no place for 0.
     """

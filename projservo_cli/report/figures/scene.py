@@ -56,7 +56,7 @@ def _data(report_data: ReportData) -> Data:
         result["robot_goal"], _, of_rig = drawn_arm(robot, plant, q_goal)
         if plant.model.on_tool:
             result["pyramids_goal"] = transformed(rig, of_rig)
-    if plant.model.on_tool:  # the face stands still
+    if plant.model.on_tool:  # the face is fixed
         return result
     if (goal := goal_displacement(robot, report_data.traces)) is not None:
         result["face_goal"] = (face @ goal.T)[:, :3]
@@ -70,7 +70,7 @@ def _data(report_data: ReportData) -> Data:
 def drawn_arm(robot: SerialArm, plant: Plant, q: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Polyline (k, 3) of the robot at joints q (n,), m, and displacements of the face and of the cameras.
 
-    From the reference one of both has moved with the tool: in the base frame the other stands still.
+    From the reference one of both has moved with the tool: in the base frame the other is fixed.
     """
     arm = robot.model(plant.model.P)
     moved, still = forward_kinematics(arm, q), np.eye(4)
@@ -85,7 +85,7 @@ def transformed(points: FloatArray, H: FloatArray) -> FloatArray:
 
 
 def goal_displacement(robot: SerialArm, traces: Mapping[str, Trace]) -> FloatArray | None:
-    """Displacement (4, 4) of the tool from the reference to the goal; None where only images are known."""
+    """Displacement (4, 4) of the tool from the reference to the goal; None if only images are known."""
     poses = (trace.goal_pose for trace in traces.values() if np.isfinite(trace.goal_pose).all())
     pose = next(poses, None)
     return None if pose is None else np.asarray(pose @ np.linalg.inv(robot.base_tool))
@@ -94,13 +94,15 @@ def goal_displacement(robot: SerialArm, traces: Mapping[str, Trace]) -> FloatArr
 def features_in_space(plant: Plant, traces: Mapping[str, Trace]) -> tuple[FloatArray, FloatArray] | None:
     """Points (g, 3, 3) that span features of the tool at the start and of the scene, m, NaN beyond.
 
-    They are where the true cameras see what was measured; None of a whole pose, by one camera, and of
+    They are where the true cameras see the measured features; None for a whole pose, by one camera, and of
     cameras that move.
     """
-    shown = next((found for trace in traces.values() if (found := trace.of_incidences) is not None), None)
-    if shown is None or len(plant.model.P) < 2 or plant.model.on_tool:
+    of_incidences_first = next(
+        (found for trace in traces.values() if (found := trace.of_incidences) is not None), None
+    )
+    if of_incidences_first is None or len(plant.model.P) < 2 or plant.model.on_tool:
         return None
-    pixels = np.stack([shown.feature_s[0], shown.feature_s_star])
+    pixels = np.stack([of_incidences_first.feature_s[0], of_incidences_first.feature_s_star])
     straight = undistort(plant.model.lens, np.moveaxis(pixels, -2, 0).reshape(len(plant.model.P), -1, 2))
     points = np.full((straight.shape[1], 3), np.nan)
     for k in np.flatnonzero(np.isfinite(straight).all(axis=(0, 2))):
@@ -205,7 +207,7 @@ def _show(figure: "style.Figure", data: Data, lines: Sequence[tuple[FloatArray, 
     towards = rig[:, 0].mean(axis=0) - points.mean(axis=0)
     above = np.linalg.norm(towards[:2]) < 0.3 * np.linalg.norm(towards)  # a rig that looks along z
     azim = 45.0 if above else float(np.degrees(np.arctan2(towards[1], towards[0]))) - 62.0
-    if above:  # its numbers are on the left, and would stand on the axis
+    if above:  # its numbers are on the left, and would overlap the axis
         axes.zaxis.set_tick_params(pad=12)
         axes.zaxis.labelpad = 18
     axes.view_init(elev=22, azim=azim)

@@ -14,8 +14,8 @@ from projservo_cli.store.sweep_table import SweepTable
 _LAW = "law"  # column
 _OFFSET = "task.start_offset."  # prefix of the columns of a start offset
 _ANGLES = tuple(range(0, 181, 30))  # edges of rotations, deg
-_BINS = 8  # of a value that is drawn
-_POINTS = 2_000  # of a curve
+_BINS = 8  # bins of a plotted value
+_POINTS = 2_000  # points of a curve
 
 
 def wilson_interval(successes: int, count: int) -> tuple[float, float]:
@@ -114,7 +114,7 @@ def _draw_success(data: Data, figure: "style.Figure") -> None:
 
 
 def draw_basin(data: Data, figure: "style.Figure") -> None:
-    """Success of each law over two start offsets, as a map with a panel for each; pale where none begins.
+    """Success of each law over two start offsets, as a map with a panel for each; pale if none begins.
 
     ``data`` has ``x`` (k,), ``y`` (j,), ``label_x``, ``label_y`` and for each law ``<law>.share`` (j, k).
     """
@@ -129,7 +129,7 @@ def draw_basin(data: Data, figure: "style.Figure") -> None:
     for axes, law in zip(panels, laws, strict=False):
         mesh = axes.pcolormesh(x, y, 100.0 * data[f"{law}.share"], vmin=0, vmax=100)
         axes.grid(visible=False)
-        axes.set(title=law, facecolor=style.PALE)  # pale where no run can begin
+        axes.set(title=law, facecolor=style.PALE)  # pale if no run can begin
         axes.set_xticks(data["x"][:: max(1, len(data["x"]) // 5)])
         axes.set_yticks(data["y"][:: max(1, len(data["y"]) // 5)])
     for axes in panels[len(laws) :]:

@@ -79,7 +79,7 @@ def _axis(H_hat: FloatArray, A_c: FloatArray, A: FloatArray) -> FloatArray:
     "target plane, and turned within it.",
 )
 def _draw_partition(data: Data, figure: "style.Figure") -> None:
-    """Three panels, one a part."""
+    """Three panels, one per part."""
     row = figure.subplots(1, 3, width_ratios=[1.1, 1, 1])
     onto, within = (_signed(angle) for angle in data["angles_deg"])
     moved = np.stack([data["A_t"], data["A_star"]])
@@ -190,7 +190,7 @@ def _translation(axes: "style.Axes", share: FloatArray, margin: FloatArray, zero
 def _margin(
     axes: "style.Axes", x: FloatArray, margin: FloatArray, line: style.LineStyle, end: float | None = None
 ) -> None:
-    """A visibility margin over a motion, where the face is hidden by it, and the end, else the last."""
+    """A visibility margin over a motion, where the face is hidden by it, and the end, or the last."""
     axes.plot(x, np.where(margin > 0, np.nan, margin), **_HIDDEN)
     axes.plot(x, margin, **line)
     last = (x[-1], margin[-1]) if end is None else (end, np.interp(end, x, margin))
@@ -211,7 +211,8 @@ _NODES = 81
 _TURNS = 41  # shares μ_p tried at each μ_t, μ_r
 _TICKS = 11  # points at equal steps of σ on the path
 _WIDE = 4.0  # margins beyond are drawn in powers of ten
-_LEVELS = [0.25, 0.5, 0.75, *(c * 2.0**k for k in range(12) for c in (1.0, 1.5))]  # of contours of a margin
+# levels of contours of a margin
+_LEVELS = [0.25, 0.5, 0.75, *(c * 2.0**k for k in range(12) for c in (1.0, 1.5))]
 _LABEL = 0.05  # room that the number on a contour needs, in shares
 _SIGMA, _SHARE = r"path parameter $\sigma$ (1)", r"share $\mu$ (1)"
 _SHARES = (  # equal shares lie on one another: the wider shows beneath
@@ -321,7 +322,7 @@ def _middle_camera(P: FloatArray, image_size: FloatArray) -> FloatArray:
 )
 def _draw_planned(data: Data, figure: "style.Figure") -> None:
     """Left the faces from dark to light along the path, right the shares and the margins."""
-    rows = 0.2 * (len(data["view"]) > 2)  # of the legend
+    rows = 0.2 * (len(data["view"]) > 2)  # height of the legend
     figure.set_figheight(max(4.2 * style.aspect(data["faces"]) + 1.0, 3.0) + rows)
     grid = figure.add_gridspec(2, 2, width_ratios=[1.7, 1])
     _faces(figure.add_subplot(grid[:, 0]), data)
@@ -387,7 +388,7 @@ def _border_distance(report_data: ReportData, mu: FloatArray) -> FloatArray:
     turns = np.linspace(0.0, 1.0, _TURNS)
     within = np.array([exp_rotation(plan.H_hat[2], share * plan.theta_p) for share in turns])
     onto = np.array([exp_rotation(plan.H_hat[1], share * plan.theta_r) for share in mu])
-    # Markers first, so that what follows is whole arrays: it took a tenth of a second of every report.
+    # Markers first, so that the rest uses whole arrays: it took a tenth of a second of every report.
     M = np.einsum("rij,pmj->mrpi", onto, plan.A @ np.swapaxes(within, 1, 2)).copy()
     moved = M @ plan.H_hat[0].T
     depth = np.sign(np.einsum("vc,mc->vm", P[:, 2], plan.A))[:, :, None, None]
@@ -429,8 +430,8 @@ def _draw_path(data: Data, figure: "style.Figure") -> None:
         style.near_zero_scale(margins, 1.0)
     margins.set_ylim(bottom=min(-0.1, 1.1 * float(np.nanmin(data["along"]))))
     path = _PATH | {"marker": "o", "label": r"path, at tenths of $\sigma$"}
-    shown = [line for name, line in _REGIONS.items() if data[name].min() < 0.0]
-    style.legend_below(figure, 4, [*shown, path])
+    violated = [line for name, line in _REGIONS.items() if data[name].min() < 0.0]
+    style.legend_below(figure, 4, [*violated, path])
 
 
 def _map(axes: "style.Axes", data: Data, view: int) -> None:

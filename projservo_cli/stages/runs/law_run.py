@@ -49,8 +49,8 @@ from projservo_cli.task.face import Task, center_of
 from projservo_cli.task.incidences import whole_pose
 from projservo_cli.task.target import TaskImages, followed
 
-_RETREAT = 10  # periods by which an arm goes back where the object of its goal moves
-_NOT_DRIVEN: Any = None  # in place of what a run leaves
+_RETREAT = 10  # periods by which an arm goes back if the object of its goal moves
+_NOT_DRIVEN: Any = None  # replaces the results of a run
 
 
 @dataclass(eq=False)
@@ -58,19 +58,20 @@ class LawRun:
     """A run of a law: made, driven to its verdict, and summed up."""
 
     scenario: RunScenario
-    plan: Plan | FloatArray  # of the task, or the joint motions (2, n) of its rotations where that is enough
+    # plan of the task, or the joint motions (2, n) of its rotations if that is enough
+    plan: Plan | FloatArray
     law: str
     mode: str = REGULATE  # law, mode: of the run
     planned_s: float | None = None  # when the plan that it follows arrives, s
     unplanned: str = ""  # why it goes without the plan that it was to follow
     believed: Model | None = None  # robot and rig as the law has them; None for the default of its kind
-    factory: Callable[[Any], Any] | None = None  # makes the law of its setup; None for that of its name
-    robot: Any = None  # an object of the contract; None for that of the configuration
+    factory: Callable[[Any], Any] | None = None  # makes the law of its setup; None for the law of its name
+    robot: Any = None  # an object of the contract; None for the configured one
     blind: bool = False  # whether a robot may move although cameras show no marker of the calibration
-    session: Session | None = None  # whose robot is driven; None for a connection of its own
+    session: Session | None = None  # connection to the robot; None to open one
     # As it ended.
     verdict: str = ""
-    why: Finding | None = None  # what held, disturbed or failed it, where something did
+    why: Finding | None = None  # reason why it was held, disturbed or failed, if it was
     steps: int = 0  # commands sent
     log: Log = _NOT_DRIVEN  # the recorded run, once it was driven
     limited: float = 0.0  # how often visibility limited the translation
@@ -78,12 +79,12 @@ class LawRun:
     replannings: tuple[Finding, ...] = ()
     driven: DrivenRobot | None = None  # client of a robot of the contract
     unseen: Finding | None = None  # cameras that showed nothing before the run, though they were compared
-    noise_ratio: float = 1.0  # of what pixels stated at the end to the noise of the run; at least 1
-    own_tolerance: float | None = None  # of an error that a law of somebody's states
+    noise_ratio: float = 1.0  # stated noise of pixels at the end over the noise of the run; at least 1
+    own_tolerance: float | None = None  # tolerance of an error that a user's law states
 
     @property
     def own_unit(self) -> float:
-        """Factor of errors that decide convergence, in px, to what they are told in."""
+        """Factor of errors that decide convergence, in px, to their reported unit."""
         own = self.own_tolerance
         return 1.0 if own is None else own / self.scenario.termination.image_error_px
 
@@ -108,7 +109,7 @@ class LawRun:
 
     @property
     def is_guided(self) -> bool:
-        """Whether the run follows a plan which gives way to another one where it fails."""
+        """Whether the run follows a plan which gives way to another one if it fails."""
         scenario = self.scenario
         searched = scenario.world.inputs.trajectory.profile in ("joint_space", "auto")
         if self.replans or self.law not in CODES or not searched:
@@ -137,8 +138,8 @@ class LawRun:
     def by_contract(self) -> None:
         """Drive a robot of the contract from the start of the task, where a simulated one stands.
 
-        That of ``plant.use`` is driven there, unless it starts where it stands. Before its first motion, its
-        images must agree with the calibration where it stands. The robot is stopped and closed on every way
+        The robot of ``plant.use`` is driven there, unless it starts in its current pose. Before its first
+        motion, its images must agree with the calibration there. The robot is always stopped and closed
         out, in a shared session at its end.
         """
         scenario, contract = self.scenario, self.scenario.servo.contract
@@ -245,7 +246,7 @@ class LawRun:
         factory = self.factory or plugins.find("law", self.law)
         law = plugins.called("law", self.law, factory, (setup,), {})
         return PluginLaw(
-            law, f"law {self.law}", scenario.world.least_views, scenario.termination.image_error_px
+            law, f"law {self.law}", scenario.world.min_views, scenario.termination.image_error_px
         )
 
     @cached_property

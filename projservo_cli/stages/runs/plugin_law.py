@@ -1,4 +1,4 @@
-"""Laws of somebody's, as the loop drives them."""
+"""User-defined laws, as the loop drives them."""
 
 import math
 from collections.abc import Callable
@@ -26,7 +26,7 @@ class LawSetup:
     Attributes
     ----------
     calibration : with ``predict(q)`` and ``jacobian(q)``.
-    face : (k,) indices of the face markers among those of the calibration.
+    face : (k,) indices of the face markers among the markers of the calibration.
     s_start, s_star : (V, k, 2) pixels of the face at the start and at the goal.
     plan : the planned motion.
     gains : configured gains, limits and period.
@@ -50,7 +50,7 @@ class PluginLaw:
     law : pixels (V, k, 2) of the face and joint readings (n,) to joint velocities (n,), rad/s or m/s.
     name : of it, for messages.
     least_views : number of views that are to see the face.
-    image_error_px : image error at which a run converges, px, unless the law states an error of its own:
+    image_error_px : image error at which a run converges, px, unless the law states an own error:
         ``error(s, q)``, a number, and its ``tolerance``.
     """
 

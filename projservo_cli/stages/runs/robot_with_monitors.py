@@ -1,4 +1,4 @@
-"""A robot of the contract as the loop of a law drives it: with its monitors and what is known of it."""
+"""A robot of the contract as the loop of a law drives it: with its monitors and known data."""
 
 import math
 from functools import partial
@@ -49,13 +49,13 @@ def connected_robot(
     watches = list[ObjectWatch]()
     for carried in () if plan is None else plan.carried:
         name, numbers = carried.object_name, carried.object_marker.tolist()
-        places = np.array([contract.driven.further.index(number) for number in numbers])
+        indices = np.array([contract.driven.further.index(number) for number in numbers])
         if name not in session.held.values():  # else it moves with the tool
             s, sigma = carried.s_object, carried.sigma_object
             sigma = np.full(s.shape[:2], np.nan) if sigma is None else sigma
-            watches.append(ObjectWatch(name, numbers, places, s, sigma, images_by_motion(calibration, s)))
+            watches.append(ObjectWatch(name, numbers, indices, s, sigma, images_by_motion(calibration, s)))
     alone = len(watches) == 1 and scenario.world.inputs.displaced is None
-    session.at = watches[0] if alone else None  # of several nobody says which one an action takes
+    session.at = watches[0] if alone else None  # if there are several, an action may take any
     return DrivenRobot(steered, plant, _known_of(scenario, contract, calibration, law), monitor, watches)
 
 

@@ -59,7 +59,7 @@ _EXACT_PX = 1e-3  # deviation of images that are predicted, or without noise
 # Image error of a face of three markers as it is seen, over that which counts as converged: by noise once in
 # ten thousand.
 _BY_NOISE = 2.0
-# Noise of markers at the end, over that of the run, that is told.
+# Noise of markers at the end, over the noise of the run, that is reported.
 _VAGUE = 3.0
 # Joints that moved by less in the steps in which an error must fall hardly did, rad or m.
 _HARDLY = 0.01
@@ -76,8 +76,8 @@ def trace_of(run: LawRun) -> Trace:
     lost = [run.unseen] if run.unseen else dark
     untested = () if driven is None else scenario.untested
     found = (*_reason(run, joint, remaining), *run.replannings)
-    told = None if driven is None or not driven.truths else _whole(driven.truths, rows)
-    poses = scenario.world.poses(run.plant, run.true_ends, log.H[:rows], told, scenario.joints_at_goal)
+    tool_poses = None if driven is None or not driven.truths else _whole(driven.truths, rows)
+    poses = scenario.world.poses(run.plant, run.true_ends, log.H[:rows], tool_poses, scenario.joints_at_goal)
     values = run.summary._asdict() | {"center_deviation_mm": run.deviation_mm()} | poses.numbers
     return Trace(
         view=scenario.world.view,
@@ -183,7 +183,7 @@ def _credible(run: LawRun) -> bool:
 
 
 def _stated_mm(run: LawRun) -> dict[str, Any]:
-    """State how far the face ended from the goal, rms mm: by images, and by what no test tells from none.
+    """State the final distance of the face from the goal, rms mm: by images, and with undetectable errors.
 
     Nothing if no length on the face is known, or images disagree with the calibration.
     """
@@ -195,11 +195,11 @@ def _stated_mm(run: LawRun) -> dict[str, Any]:
     s, s_star = run.log.s[run.steps], scenario.images_for(run.law).s_star
     posture = Posture(scenario.world.model, q, M[:m], scenario.world.inputs.lengths)
     whole = np.isfinite(s[:, :m]).all(axis=(1, 2))
-    if not posture.known or whole.sum() < scenario.world.least_views:
+    if not posture.known or whole.sum() < scenario.world.min_views:
         return {}
     used: BoolArray = np.isfinite(s + s_star)[..., 0]
     off = np.where(used[..., None], s - s_star, 0.0).ravel()
-    # By all markers that the law measures with, and by the face itself.
+    # Measure by all markers that the law uses, and by the face itself.
     measured = (used, used & (np.arange(len(numbers)) < m))
     parts, found = [max(float(np.linalg.norm(posture.carry(M, by) @ off)) for by in measured)], {}
     if run.driven is not None and run.driven.monitor is not None:
@@ -214,7 +214,7 @@ def _stated_mm(run: LawRun) -> dict[str, Any]:
 
 
 def _left(log: Log, steps: int) -> tuple[float | None, float | None]:
-    """Share of the translation and rotation, deg, that were left; None where the law measures neither."""
+    """Share of the translation and rotation, deg, that were left; None if the law measures neither."""
     first, last = (float(log.errors[k, TAU_AFFINE]) for k in (0, steps))
     turn = float(log.errors[steps, THETA_S])
     share = last / first if first > 0.0 and math.isfinite(last) else None
@@ -222,7 +222,7 @@ def _left(log: Log, steps: int) -> tuple[float | None, float | None]:
 
 
 def _rms(squares: FloatArray, count: FloatArray) -> FloatArray:
-    """Root of the mean of sums of squares; NaN where the count is not positive."""
+    """Root of the mean of sums of squares; NaN if the count is not positive."""
     mean = np.full(squares.shape, math.nan)
     np.divide(squares, count, out=mean, where=count > 0.0)
     return np.asarray(np.sqrt(mean))
@@ -259,7 +259,7 @@ def _incidences(run: LawRun) -> IncidenceHistory | None:
 
 
 def _free(run: LawRun, task: Task, H: FloatArray) -> dict[str, Any]:
-    """Joint motions that incidences leave free at the end, where the body is displaced by H (4, 4)."""
+    """Joint motions that incidences leave free at the end, if the body is displaced by H (4, 4)."""
     model, q = run.scenario.world.model, run.log.read[run.steps]
     if not np.isfinite(H).all():
         return {}
@@ -270,14 +270,14 @@ def _free(run: LawRun, task: Task, H: FloatArray) -> dict[str, Any]:
 
 
 def _incidence_errors(run: LawRun, images: TaskImages, H: FloatArray, taught: FloatArray) -> IncidenceErrors:
-    """State how far incidences (g,) are off at the end, where the body is displaced by H (4, 4).
+    """State errors of incidences (g,) at the end, if the body is displaced by H (4, 4).
 
     taught : (g, 4, 4) displacements of the body where each was taught.
     """
     scenario, world, plan = run.scenario, run.scenario.world, run.plan
     objects = plan.carried if isinstance(plan, Plan) else ()
-    s, shown = np.full_like(images.s_star, np.nan), run.log.s[run.steps]
-    s[:, : shown.shape[1]] = shown  # of a law that measures points those of the face alone
+    s, on_face = np.full_like(images.s_star, np.nan), run.log.s[run.steps]
+    s[:, : on_face.shape[1]] = on_face  # a law that measures points has the face alone
     now = ObjectView(s, np.full(s.shape[:2], max(world.noise_px, _EXACT_PX)))
     found, markers = np.full((4, len(taught)), np.nan), world.calibration.indices_of(world.numbers)
     for carrier in images.goal.carriers:
@@ -290,8 +290,8 @@ def _incidence_errors(run: LawRun, images: TaskImages, H: FloatArray, taught: Fl
             ObjectView(place.s, np.full(s.shape[:2], max(sigma, _EXACT_PX))),
             [images.goal.incidences[k] for k in own],
         )
-        shown = all(one.visible_by(range(len(markers))) for one in asked)
-        points = NO_POINTS if shown else markers_now(world.calibration, objects[carrier - 1])
+        on_face = all(one.visible_by(range(len(markers))) for one in asked)
+        points = NO_POINTS if on_face else markers_now(world.calibration, objects[carrier - 1])
         ends = TaughtAndNow(goal, now, taught[own[0]], H, *more, points)
         found[:, own] = incidence_errors(world.calibration, markers, asked, ends, world.inputs.lengths)
     return IncidenceErrors(*found)
@@ -373,8 +373,8 @@ def _noisy_markers(run: LawRun) -> Iterator[Finding]:
 
 
 def _apart(run: LawRun) -> Iterator[Finding]:
-    """Tell that the face as it is seen is off by more than noise, though the whole body is not."""
-    displaced = run.scenario.world.inputs.displaced  # to where it was never seen
+    """Report a visible face that errs by more than noise, although the whole body does not."""
+    displaced = run.scenario.world.inputs.displaced  # its goal was never seen
     if run.scenario.exact.goal.incidences or displaced:  # the face may be anywhere that they leave open
         return
     limits = run.scenario.termination

@@ -47,12 +47,12 @@ _UNKNOWN = Ends(np.full((4, 4), np.nan), np.full((4, 4), np.nan), np.full(4, np.
 
 
 class TruePoses(NamedTuple):
-    """Where the tool was in a run, by the truth or as its robot says; NaN if unknown."""
+    """Poses of the tool in a run, by the truth or by its robot; NaN if unknown."""
 
     pose: FloatArray  # (k, 4, 4) of the tool, m
     goal_pose: FloatArray  # (4, 4) of the tool, m
     center: FloatArray  # (k, 3) of the face, m
-    numbers: dict[str, float]  # of a trace, that these give
+    numbers: dict[str, float]  # numbers of a trace from these
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +62,7 @@ class CalibratedWorld:
     inputs: PlanInputs
     calibration: Calibration
     joints: Joints  # as the laws take them
-    numbers: tuple[int, ...]  # of the markers by which the face is measured, those of the face first
+    numbers: tuple[int, ...]  # markers that measure the face, the face first
 
     moves_unseen = False  # whether a motion that no camera sees does no harm
 
@@ -77,9 +77,9 @@ class CalibratedWorld:
         return len(self.inputs.face)
 
     @property
-    def least_views(self) -> int:
-        """Number of views that are to see the whole face. Raises InputError if there are not so many."""
-        asked, V = self.inputs.trajectory.least_views, len(self.view)
+    def min_views(self) -> int:
+        """Number of views that are to see the whole face. Raises InputError if there are fewer."""
+        asked, V = self.inputs.trajectory.min_views, len(self.view)
         if asked is not None and asked > V:
             raise InputError(f"trajectory.visible_views: {asked}, of {V} views: set {V} or all")
         return asked or V
@@ -96,12 +96,12 @@ class CalibratedWorld:
 
     @cached_property
     def body(self) -> Body:
-        """Body of all markers by which the face is measured; none where it is measured point by point."""
+        """Body of all markers by which the face is measured; none if it is measured point by point."""
         points = measures_points(self.inputs.features, self.calibration)
         return NO_BODY if points else _body(self.calibration, self.numbers)
 
     def require_body(self, what: str) -> None:
-        """Refuse what takes the body, where the face is measured point by point, with a WorkFailed."""
+        """Raise WorkFailed for users of the body, if the face is measured point by point."""
         if not len(self.body.M):
             raise WorkFailed(
                 f"{what} with the body, and the calibration is not usable: calibrate again, or set "
@@ -147,7 +147,7 @@ class CalibratedWorld:
         if wrong := self.joints.limit_passed(q):
             raise InputError(f"{key}: {sentence(wrong)}: choose another")
         s = predict(self.calibration, q[None])[0][:, self.calibration.indices_of(self.numbers)]
-        if np.isnan(s[:, : self.m]).any(axis=(1, 2)).sum() > len(s) - self.least_views:
+        if np.isnan(s[:, : self.m]).any(axis=(1, 2)).sum() > len(s) - self.min_views:
             raise WorkFailed(f"{key}: by the calibration, the face is not in front of the cameras there")
         return np.ascontiguousarray(s)
 
@@ -180,7 +180,7 @@ class CalibratedWorld:
     ) -> tuple[ObjectView, ObjectView]:
         """Images of an object when the goal was taught, and now.
 
-        session : connection to the robot that looks where it stands; None for one of its own.
+        session : connection to the robot that observes in its present pose; None to open one.
         q_taught : (n,) joints at which the goal was taught, if they are known.
         """
         now = self._observed_now(carrier, session, ends.q_start)
@@ -191,7 +191,7 @@ class CalibratedWorld:
     def _observed_now(
         self, carrier: CarryingObject, session: Session | None, q_start: FloatArray
     ) -> ObjectView:
-        """Images of an object by the robot where it stands, or by a simulated one at the start (n,)."""
+        """Images of an object by the robot in its present pose, or by a simulated one at the start (n,)."""
         assert carrier.driven is not None
         rest = carrier.rest
         with nullcontext(session) if session else Session() as own:
@@ -211,7 +211,7 @@ class CalibratedWorld:
         raise InputError(f"task.goal does not show where {carrier.name} was: teach it again, projservo teach")
 
     def metric_model(self, law: str) -> Model:
-        """Return the metric model that a classical law is given; InputError where none is described."""
+        """Return the metric model that a classical law is given; InputError if none is described."""
         arm = self.inputs.arm
         P = None if arm is None else self.inputs.cameras_at(arm.q_reference)
         if arm is None or P is None:
@@ -232,12 +232,12 @@ class CalibratedWorld:
     ) -> Plant:
         """Return the robot, undisturbed, as a law sees it from joints (n,).
 
-        images : start and goal as the law measures them, which tell the sides of a face that is believed.
+        images : start and goal as the law measures them, which decide the sides of a face that is trusted.
         pins : whether a simulated one shows the markers of the body that are not on the face.
         """
-        shown = images()
-        shown = shown.by_points() if len(shown.pair) else shown
-        task = shown.asking(()).task(self.model)  # the face of the goal, whatever is judged
+        images_of_goal = images()
+        images_of_goal = images_of_goal.by_points() if len(images_of_goal.pair) else images_of_goal
+        task = images_of_goal.asking(()).task(self.model)  # the face of the goal, for any incidences
         face = self.calibration.indices_of(self.numbers[: self.m])
         return Plant(
             model=self.model,
@@ -249,11 +249,11 @@ class CalibratedWorld:
             image_size=image_sizes(self.inputs.image_size, self.view),
             limits=self.joints.limits,
             opaque=False,
-            least_views=self.least_views,
+            min_views=self.min_views,
         )
 
     def require_ready(self) -> None:
-        """Refuse to drive a robot with a calibration that does not tell where it goes."""
+        """Refuse to drive a robot with a calibration that cannot predict its motion."""
         if not self.calibration.usable:
             raise WorkFailed("the calibration is not usable, and no robot is driven with it: calibrate again")
         if order := order_advice(self.calibration):
@@ -266,7 +266,7 @@ class CalibratedWorld:
     ) -> Steered:
         """Open the robot of a contract in a session, unless it is.
 
-        q_start, plant : joints (n,) of a simulated one, and what it shows; given : an object in its place.
+        q_start, plant : joints (n,) of a simulated one, and its plant; given : an object in its place.
         """
         return opened_robot(session, contract.driven, self.joints, self.observed, self.view, given)
 
@@ -276,7 +276,7 @@ class CalibratedWorld:
         """Bring an open robot to the start (n,); the cameras that showed nothing there, if any.
 
         blind : whether it may move although cameras show no marker of the calibration.
-        Raises WorkFailed, before its first motion, where its images disagree with the calibration.
+        Raises WorkFailed, before its first motion, if its images disagree with the calibration.
         """
         assert contract.settle_s is not None
         driven.robot.require_identity(contract.identity)
@@ -288,7 +288,7 @@ class CalibratedWorld:
         for _ in () if stands else path:
             if wrong := driven.agrees():
                 self._stop(driven, "stopped on the path to the start, since", wrong)
-        if wrong := driven.at_rest(held=True):
+        if wrong := driven.at_rest(wait=True):
             raise failed([wrong], self.setup, begin="stopped at the start, since ", refutes=True)
         at_start = self._require_images(driven, "stopped at the start of the task, since", 2, blind=blind)
         return at_start or unseen
@@ -298,11 +298,11 @@ class CalibratedWorld:
         raise failed([fault], self.setup, begin=f"{what} ", refutes=not driven.object_moved)
 
     def _require_images(self, driven: DrivenRobot, what: str, seeing: int, *, blind: bool) -> Finding | None:
-        """Refuse to move a robot of which fewer than so many cameras show markers, unless that was asked for.
+        """Refuse to move a robot unless enough cameras show markers, or ``blind`` was requested.
 
         Of fewer cameras, all must.
         """
-        unseen = driven.unseen(seeing, held=seeing > 1)
+        unseen = driven.unseen(seeing, wait=seeing > 1)
         if unseen and not blind:
             found = [unseen, *driven.robot.remarks()]
             mend = (
@@ -313,28 +313,28 @@ class CalibratedWorld:
         return unseen
 
     def judged(self, summary: Summary) -> Summary:
-        """Return the summary of a run with what this world knows of its success."""
+        """Return the summary of a run with this world's knowledge of its success."""
         return summary._replace(success=math.nan)
 
     def poses(
-        self, plant: Plant, ends: Ends, H: FloatArray, told: FloatArray | None, goal_joints: FloatArray
+        self, plant: Plant, ends: Ends, H: FloatArray, reached: FloatArray | None, goal_joints: FloatArray
     ) -> TruePoses:
         """Return where the tool was at displacements H (k, 4, 4).
 
-        told : poses (k, 4, 4) or joints (k, n) by which a robot says so; goal_joints : (g, n) at the goal.
+        reached : poses (k, 4, 4) or joints (k, n) that a robot reports; goal_joints : (g, n) at the goal.
         """
         arm, goal, unknown = self.inputs.arm, np.full((4, 4), np.nan), np.full((len(H), 3), np.nan)
-        if told is None:
+        if reached is None:
             return TruePoses(H * np.nan, goal, unknown, {})
         if arm is not None and len(goal_joints):
             goal = arm.pose(goal_joints[0])
-        if told.ndim != 3:
-            told = np.array([goal * np.nan if arm is None else arm.pose(q) for q in told])
+        if reached.ndim != 3:
+            reached = np.array([goal * np.nan if arm is None else arm.pose(q) for q in reached])
         numbers = {
-            "position_error_mm": MM * float(np.linalg.norm(goal[:3, 3] - told[-1, :3, 3])),
-            "rotation_error_deg": math.degrees(angle_between(mat(told[-1]), mat(goal))),
+            "position_error_mm": MM * float(np.linalg.norm(goal[:3, 3] - reached[-1, :3, 3])),
+            "rotation_error_deg": math.degrees(angle_between(mat(reached[-1]), mat(goal))),
         }
-        return TruePoses(told, goal, unknown, numbers)
+        return TruePoses(reached, goal, unknown, numbers)
 
 
 def observed_numbers(inputs: PlanInputs, calibration: Calibration) -> tuple[int, ...]:
@@ -347,15 +347,15 @@ def observed_numbers(inputs: PlanInputs, calibration: Calibration) -> tuple[int,
 
 
 def _stands_at(driven: DrivenRobot, q: FloatArray) -> bool:
-    """Whether a robot stands at joints (n,), as near as it is held."""
+    """Whether a robot is at joints (n,), as near as it is held."""
     away = np.abs(driven.steered.observe().q - q)
     return bool((away <= np.maximum(driven.robot.bounds.sag, STILL)).all())
 
 
 def measures_points(features: str | None, calibration: Calibration) -> bool:
-    """Whether the face is measured point by point: as asked for, else where no body is calibrated well.
+    """Whether the face is measured point by point: as configured, otherwise if no body is calibrated well.
 
-    Raises InputError where points are asked for and there are not two views.
+    Raises InputError if points are required and there are not two views.
     """
     view = calibration.view
     if not is_stereo(view):

@@ -32,11 +32,11 @@ def plugin_robot(
     *,
     further: Sequence[int] = (),
 ) -> PluginRobot:
-    """Make a robot of somebody's, unless it is given; an InputError where a joint has no speed limit.
+    """Make the user's robot, unless it is given; an InputError if a joint has no speed limit.
 
     types : one letter a joint, R or P; numbers : of the markers of the tool that the robot observes; further
-        : of those of objects, likewise.
-    view : names of the views of readings, which go on where a camera is lost; None for all of the robot's,
+        : of markers of objects, likewise.
+    view : names of the views of readings, which go on if a camera is lost; None for all of the robot's,
         none of which may be lost.
     """
     limited = np.isfinite(bounds.limits.speed)
@@ -59,9 +59,9 @@ def plugin_robot(
 
 
 def _made(own: OwnRobot, numbers: Sequence[int], bounds: Bounds, *, whole: bool) -> Robot:
-    """Make an object of the class of a robot, with its options, and cameras where it brings none.
+    """Make an object of the class of a robot, with its options, and cameras if it brings none.
 
-    A class that takes an argument ``limits`` is given those of its joints, and ``numbers`` all numbers.
+    A class that takes an argument ``limits`` is given the limits of its joints, and ``numbers`` all numbers.
 
     whole : whether none of these cameras may be lost.
     """
@@ -124,9 +124,9 @@ def path_to(
 ) -> Iterator[Reading]:
     """Move to joints (n,) along a straight line at the speed limit and come to rest there.
 
-    what : the command it is for, in messages.
+    what : its command, for messages.
     fit : is shown the first reading, before anything moves; it raises where nothing should.
-    Yields the reading after each command. The robot has then stood still for so many s, and so have the
+    Yields the reading after each command. The robot has then been at rest for a time, s, and so have the
     images. Raises WorkFailed if a joint does not follow, goes the other way, or nothing comes to rest, or if
     one reads a whole turn beyond its limits.
     """
@@ -160,7 +160,7 @@ def path_to(
 
 
 def simulated_robot(driven: Drive, joints: Joints, robot: FaultyRobot) -> PluginRobot:
-    """A simulated robot of the contract, which is never late, and goes beyond its limits where it may."""
+    """A simulated robot of the contract, which is never late, and goes beyond its limits if it may."""
     bounds = driven.following.bounds(joints)
     if driven.endless:
         endless = np.full(len(joints.types), math.inf)
@@ -177,7 +177,7 @@ def opened_robot(
     view: Sequence[str],
     given: Robot | None = None,
 ) -> Steered:
-    """Open a robot of somebody's in a session, unless it is; nothing is moved.
+    """Open the user's robot in a session, unless it is open; no joint is moved.
 
     observed : numbers of the markers of the tool; view : names of the views of the calibration.
     given : an object of the contract instead of one of a class.

@@ -102,7 +102,7 @@ class SimulatedWorld(CalibratedWorld):
         return np.eye(4) if placed is None else placed.T
 
     def _displaced(self, images: TaskImages, ends: Ends) -> Ends:
-        """Return the true ends of a task with its goal displaced, if that is asked for."""
+        """Return the true ends of a task with its goal displaced, if requested."""
         asked, truth = self.inputs.displaced, self.truth
         if asked is None or not len(images.body.M):
             return ends
@@ -178,7 +178,7 @@ class SimulatedWorld(CalibratedWorld):
         self, q_start: FloatArray, images: Callable[[], TaskImages], *, pins: bool, opaque: bool
     ) -> Plant:
         """Return the true robot, undisturbed, from joints (n,)."""
-        found = plant_of(self.truth, q_start, opaque=opaque, least_views=self.least_views)
+        found = plant_of(self.truth, q_start, opaque=opaque, min_views=self.min_views)
         return found._replace(pins=self.truth.of(self.numbers[self.m :]) if pins else NO_PINS)
 
     def noise(self, numbers: Sequence[int], seed: int, times: int) -> FloatArray:
@@ -226,7 +226,7 @@ class SimulatedWorld(CalibratedWorld):
     def begin(
         self, driven: DrivenRobot, contract: Contract, q_start: FloatArray, *, blind: bool
     ) -> Finding | None:
-        """Return at once: a simulated robot stands at the start."""
+        """Return at once: a simulated robot is at the start."""
         return None
 
     def judged(self, summary: Summary) -> Summary:
@@ -234,7 +234,7 @@ class SimulatedWorld(CalibratedWorld):
         return summary
 
     def poses(
-        self, plant: Plant, ends: Ends, H: FloatArray, told: FloatArray | None, goal_joints: FloatArray
+        self, plant: Plant, ends: Ends, H: FloatArray, reached: FloatArray | None, goal_joints: FloatArray
     ) -> TruePoses:
         """Return where the tool was at displacements H (k, 4, 4)."""
         center = np.asarray(H @ np.array(center_of(plant.M, plant.center)))[:, :3]
@@ -294,11 +294,11 @@ class RenderedWorld(SimulatedWorld):
         """
         unseen = np.isnan(s[..., 0])
         unseen[:, self.m :] = False
-        if (~unseen.any(axis=1)).sum() >= self.least_views:
+        if (~unseen.any(axis=1)).sum() >= self.min_views:
             return s
         view, k = np.argwhere(unseen)[0]
         known, much = self.calibration, np.isfinite(s[..., 0]).sum(axis=1) > CORNERS - 1
-        if much.sum() >= self.least_views:
+        if much.sum() >= self.min_views:
             unseen[~much] = False
             off = 0.0
             if q is None:
@@ -347,7 +347,7 @@ def _simulated_ends(
 ) -> tuple[TaskImages, FloatArray | None]:
     """Return the images of the ends of a task, for any seed and noise, and the joints (n,) at the goal.
 
-    current : joints where the arm stands, if that is known.
+    current : present joints of the arm, if known.
     """
     at = None if current is None else np.array(current)
     M_pins, robot = truth.of(pins), truth.robot

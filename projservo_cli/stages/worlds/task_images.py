@@ -32,7 +32,7 @@ def task_images(
     how : position of the centre marker within the face, or ``MIDPOINT``; names of the views.
     images : pixels (V, b, 2) at the joints (n,) of a key of the configuration.
     turn : joints (n,) of a goal that is a turn from the joints (n,) of the start.
-    q_current : (n,) joints where the arm stands, if that is known.
+    q_current : (n,) present joints of the arm, if known.
     """
     pins, given, (center, view) = len(numbers[1]), task.goal.joints, how
     q_start = q_from = _joints_at_start(task, q_current, types)
@@ -51,7 +51,7 @@ def task_images(
 
 
 def _joints_at_start(task: TaskSettings, q_current: FloatArray | None, types: str) -> FloatArray:
-    """Joints (n,) at the start, rad or m. Raises InputError where nobody has asked where the arm stands."""
+    """Joints (n,) at the start, rad or m. Raises InputError if required present joints are unknown."""
     if task.start_joints is not None:
         return task.start_joints.values(types)
     if q_current is None:
@@ -67,16 +67,16 @@ def unseen(views: int) -> tuple[tuple[float, float], ...]:
 def given_pixels(
     images: GoalImages, numbers: Sequence[int], face: Sequence[int], view: Sequence[str]
 ) -> tuple[FloatArray, FloatArray]:
-    """Images (V, k, 2) that are given of some markers, and their deviations (V, k), px; NaN where not given.
+    """Images (V, k, 2) that are given of some markers, and their deviations (V, k), px; NaN if not given.
 
     face : numbers of the markers that images without numbers are of.
     """
     pixels, none = images.pixels(face, view), unseen(len(view))
     s = np.array([pixels.get(number, none) for number in numbers]).swapaxes(0, 1)
-    told = [number for number in numbers if number in pixels]
+    stated_numbers = [number for number in numbers if number in pixels]
     sigma = np.full(s.shape[:2], np.nan)
     known = [number in pixels for number in numbers]
-    sigma[:, known] = np.array(images.deviations(told, face, view)).reshape(len(s), -1)
+    sigma[:, known] = np.array(images.deviations(stated_numbers, face, view)).reshape(len(s), -1)
     return s, sigma
 
 
@@ -88,7 +88,7 @@ def positioned(asked: StandOff, numbers: Sequence[int]) -> StandOff:
 def in_body(points: Flat, numbers: Sequence[int], name: str) -> Flat:
     """Points that span a feature, by positions in the body instead of numbers of markers.
 
-    name : of what they are for, as a message begins. Raises InputError for a marker that the body lacks.
+    name : of their use, as a message begins. Raises InputError for a marker that the body lacks.
     """
     for number in chain.from_iterable(points):
         if number not in numbers:
