@@ -532,7 +532,7 @@ class ParameterErrors(RecordPart):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class JointEvidence(RecordPart):
-    """How well each joint is determined, and where its readings were."""
+    """Determination of each joint, and the range of its readings."""
 
     excitation: FloatArray = _array("joint", "rad or m", "range of joint motion in the data")
     joint_min: FloatArray = _array("joint", "rad or m", "minimum joint reading in the data")
@@ -912,7 +912,7 @@ class TaskPartition(RecordPart):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FaceVisibility(RecordPart):
-    """Where each view sees the face by translation and rotation, and both senses of the latter."""
+    """Visibility of the face in each view by translation and rotation, and both senses of the latter."""
 
     optical_center: FloatArray = _array("view coordinate", about="optical centres")
     tau_0: FloatArray = _array("view", about="translation at which visibility changes")
@@ -1010,7 +1010,7 @@ class CarriedByObject(RecordPart):
 
     @property
     def object_words(self) -> str:
-        """How far the object has moved and how well its goal is known, in words."""
+        """Displacement of the object and deviation of its goal, in words."""
         shift = [
             f"{number:.3g} {unit}"
             for number, unit in (
@@ -1092,7 +1092,7 @@ class Plan(Composite):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RunErrors(RecordPart):
-    """How far a run ended from its goal."""
+    """Distance of the end of a run from its goal."""
 
     position_error_mm: float | None = _scalar(
         "mm",
@@ -1255,7 +1255,7 @@ class IncidenceHistory(RecordPart):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PlanFollowing(RecordPart):
-    """How a run followed its plan."""
+    """Adherence of a run to its plan."""
 
     mode: str = _scalar(
         about="regulate: each step moves to the goal by the present images; track, image_track: by the plan"

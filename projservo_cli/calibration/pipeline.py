@@ -486,7 +486,7 @@ def _quality(solution: Solution, expected: Expected) -> FitQuality:
 def _joint_evidence(
     result: Projective, detections: Detections, span: FloatArray, noise: FloatArray
 ) -> JointEvidence:
-    """How well the data of a fit determine its joints, by their span and the noise of predictions, (n,)."""
+    """Determination of joints by the data of a fit: their span and the noise of predictions, (n,)."""
     operator_defect, trace_defect, plane_defect = result.defects()
     return JointEvidence(
         excitation=span,

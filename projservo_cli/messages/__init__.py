@@ -52,8 +52,8 @@ def lines(findings: Iterable[Finding], setup: Setup = _SETUP) -> tuple[str, ...]
 
 def table_row(one: Finding, setup: Setup) -> dict[str, str]:
     """Return a finding as a row of a table: level, subject, message and remedy."""
-    remaining = Wording([one], setup)
-    where, remedy = remaining.text("where") or "robot and cameras", remaining.text("remedy")
+    wording = Wording([one], setup)
+    where, remedy = wording.text("where") or "robot and cameras", wording.text("remedy")
     return {"level": _LEVELS[one.severity], "where": where, "text": sentence(one, setup), "remedy": remedy}
 
 

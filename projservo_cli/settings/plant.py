@@ -99,7 +99,7 @@ class ServoLimits(Section):
 
 
 class Rest(Section):
-    """How long a robot rests before it is observed, and how many images are averaged then."""
+    """Rest of a robot before it is observed, and the number of images averaged then."""
 
     averaged_frames: StrictInt = Field(
         1, ge=1, le=1000, description="number of images of each pose that record averages"

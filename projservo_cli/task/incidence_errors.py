@@ -82,7 +82,7 @@ def angle_off(one: Incidence, tool: FloatArray, scene: FloatArray) -> float:
 
 
 class TaughtAndNow(NamedTuple):
-    """Where a goal was taught, and where the tool is: images (V, k, 2), and displacements to begin with."""
+    """Taught and present poses of the tool: images (V, k, 2), and displacements to begin with."""
 
     taught: ObjectView
     now: ObjectView

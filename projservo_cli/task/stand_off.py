@@ -31,7 +31,7 @@ class StandOff(NamedTuple):
 
     @property
     def words(self) -> str:
-        """How far the goal is displaced, as names of its incidences have it."""
+        """Displacement of the goal, as in names of its incidences."""
         by = f"{1e3 * self.by_m:g} mm" if self.by_m is not None else f"{self.by_px:g} px"
         return f"{by} back along {self.name}"
 

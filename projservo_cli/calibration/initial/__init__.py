@@ -1,1 +1,1 @@
-"""Where the adjustment begins: geometry of the views, places of markers, then screws and cameras."""
+"""Start of the adjustment: geometry of the views, places of markers, then screws and cameras."""
