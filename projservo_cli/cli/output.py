@@ -311,7 +311,7 @@ def _of_suggestions(value: dict[str, Any]) -> Iterator[str]:
             math.degrees(d) if turns else 1e3 * d for d, turns in zip(row["delta"], revolute, strict=True)
         )
         then = math.sqrt(row["variance_after"])
-        yield f"  {row['from_pose']:>9}" + "".join(f"{d:>+9.1f}" for d in way) + f"{then:>9.3g}"
+        yield f"  {row['from_pose']:>9}" + "".join(f"{d:>+9.1f}" for d in steps) + f"{then:>9.3g}"
     if value["readings"] == "flange":
         yield f"  these poses of the flange: {value['suggestions_file']} (m)"
         return

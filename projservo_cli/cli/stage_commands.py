@@ -515,7 +515,7 @@ def _work(console: Console, chain: "Chain", options: Mapping[str, Any]) -> int:
     if "calibrate" in chain.names:
         done = not chain.lacks("calibrate")
         by_joints = done and chain.run.calibration.flange_chart is None
-        beside["calibrate"]["joint_types_assumed"] = by_joints and chain.config.joint_types is None
+        more_values["calibrate"]["joint_types_assumed"] = by_joints and chain.config.joint_types is None
     if (wanted := _optional_files(options)) and not chain.lacks("report"):
         more_values["report"] |= chain.optional_files(wanted)
     more_values["report"]["replayed"] = chain.replayed()
