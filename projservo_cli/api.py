@@ -217,7 +217,7 @@ def calibrate(
     joint_model : curves of the joints to fit: ``auto`` for those that the images show, or kinds such as
         ``scale``, of all or of one: ``scale:2``; a list, or a text with commas.
     noise_px : standard deviation of a coordinate, px; by default as the observations state, otherwise
-    estimated.
+        estimated.
     seed : of the random starts; by default the seed of the observations.
     progress : called as ``progress(what, done, total)``; True for a bar in a terminal, False for none.
 
@@ -281,8 +281,7 @@ def plan(
     calibration : of the same robot and rig.
     q_start : (n,) joint readings at the start, rad or m; by default ``task.start``.
     goal : (n,) joint readings, (V, m, 2) pixels of ``markers.face`` in the views of the calibration, or
-    results that
-        ``projservo teach`` wrote, a path or a mapping; by default ``task.goal``.
+        the file that ``projservo teach`` wrote, a path or a mapping; by default ``task.goal``.
 
     Returns
     -------
@@ -324,8 +323,7 @@ def servo(
     plan : result of ``plan``; its start and goal are the task.
     law : the name of a law, ``module:Class``, or a class or function that makes one of its setup.
     mode : ``regulate``, ``track`` or ``image_track``; by default the mode in the name, such as
-    ``exact_track``,
-        else ``regulate``.
+        ``exact_track``, else ``regulate``.
     robot : an object of the contract to drive, instead of the robot of the configuration.
     blind : whether a robot may move although cameras show no marker of the calibration.
 

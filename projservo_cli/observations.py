@@ -10,11 +10,12 @@ import numpy as np
 import numpy.typing as npt
 
 from projservo_cli.calibration.detections import require_size_and_noise
-from projservo_cli.geometry.flange import FLANGE_TYPES
+from projservo_cli.geometry.flange import FLANGE_TYPES, FlangeChart
 from projservo_cli.image_size import ImageSize
 from projservo_cli.records import TOOL, VIEWS, WORLD, InputError, Observation
 from projservo_cli.settings.sections import is_view
 from projservo_cli.store.display import Displayable, checked_array, numbers_in, pandas
+from projservo_cli.store.flange_poses import require_poses
 from projservo_cli.store.observation_tables import (
     in_radians,
     mount_in,
@@ -91,7 +92,8 @@ class Observations(Displayable, Observation):
 
         Parameters
         ----------
-        q : (K, n) joint readings, rad or m unless ``joint_unit`` says deg.
+        q : (K, n) joint readings, rad or m unless ``joint_unit`` says deg, or (K, 4, 4) poses of the flange
+            in the base, m.
         pixels : (K, V, m, 2) raw pixels u, v of each marker in each of V images, NaN or masked where unseen.
         view : (V,) names of the views, such as ``("top",)``; by default left and right.
         mount : ``world`` for cameras that watch the tool, ``tool`` for cameras on it.
@@ -117,6 +119,18 @@ class Observations(Displayable, Observation):
         V = len(names)
         named = "" if view is not None else "; name the views of others: view=(...)"
         images = checked_array("pixels", pixels, (None, V, None, 2), f"(K, {V}, m, 2){named}")
+        chart = None
+        if np.ndim(q) == 3:
+            if joint_types is not None or joint_unit is not None:
+                raise InputError(
+                    "q: poses of the flange have neither joint_types nor joint_unit: leave them out"
+                )
+            T = checked_array(
+                "q", q, (len(images), 4, 4), f"({len(images)}, 4, 4), a pose of the flange each"
+            )
+            require_poses(T, [f"q[{k}]" for k in range(len(T))])
+            joint_types, joint_unit, chart = FLANGE_TYPES, "rad", FlangeChart.of(T)
+            q = chart.coordinates(T)
         readings = checked_array("q", q, (len(images), None), f"({len(images)}, n), a row for each pose")
         if not np.isfinite(readings).all():
             raise InputError("q: holds a number that is not finite; leave such poses out")
@@ -141,7 +155,13 @@ class Observations(Displayable, Observation):
         images = np.where(np.isfinite(images).all(axis=-1, keepdims=True), images, np.nan)[:, :, order]
         stated = None if stated is None else np.ascontiguousarray(stated[:, :, order])
         record = Observation(
-            numbers[1], numbers[0][order], readings, np.ascontiguousarray(images), sigma=stated, view=names
+            numbers[1],
+            numbers[0][order],
+            readings,
+            np.ascontiguousarray(images),
+            sigma=stated,
+            view=names,
+            flange_chart=None if chart is None else chart.record,
         )
         known = {"joint_types": types, "image_size": image_size, "noise_px": noise_px, "mount": mount}
         return cls.of(record, **known)
@@ -198,6 +218,7 @@ class Observations(Displayable, Observation):
         if not parts:
             raise InputError("concat: an empty list; give observations")
         marker = np.unique(np.concatenate([part.marker for part in parts]))
+        parts = _in_one_chart(parts)
         columns: dict[str, list[Any]] = {}
         motions = 0  # which are numbered on
         for part in parts:
@@ -220,7 +241,7 @@ class Observations(Displayable, Observation):
             shapes = {np.shape(one)[1:] if isinstance(one, np.ndarray) else one for one in values}
             if len(shapes) > 1:
                 raise InputError(f"concat: the observations differ in {name}: join those alike")
-            if name not in joined and isinstance(values[0], np.ndarray):
+            if name not in (*joined, "flange_chart") and isinstance(values[0], np.ndarray):
                 joined[name] = np.concatenate(values)
         return dataclasses.replace(parts[0], **joined)
 
@@ -274,6 +295,20 @@ class Observations(Displayable, Observation):
             "seen": f"{detected.mean():.0%} of {detected.size} marker-view pairs",
             "noise": "stated for each pixel" if self.noise_px is None and self.sigma is not None else noise,
         }
+
+
+def _in_one_chart(parts: Sequence["Observations"]) -> list["Observations"]:
+    """Poses of the flange in the coordinates of the first observations."""
+    chart = FlangeChart.from_optional(getattr(parts[0], "flange_chart", None))
+    moved = []
+    for part in parts:
+        own = FlangeChart.from_optional(getattr(part, "flange_chart", None))
+        if chart is not None and own is not None:
+            part = dataclasses.replace(
+                part, q=chart.coordinates(own.poses(part.q)), flange_chart=chart.record
+            )
+        moved.append(part)
+    return moved
 
 
 def _types_of(joint_types: str | Sequence[str] | None, n: int | None = None) -> str | None:

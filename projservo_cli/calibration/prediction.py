@@ -373,15 +373,20 @@ def error_factor_with_model(calibration: Calibration) -> FloatArray:
     return factor if bias is None else np.hstack([factor, bias])
 
 
+def reading_deviations(calibration: Calibration) -> FloatArray:
+    """Deviations (n,) of joint readings, rad or m; of poses of a flange, those of its twist, m then rad."""
+    sigma_q = calibration.sigma_q or 0.0
+    if calibration.flange_chart is None:
+        return sigma_q * per_rad(calibration.prismatic)
+    return np.where(calibration.prismatic, calibration.sigma_flange_m or 0.0, sigma_q)
+
+
 def reading_changes(calibration: Calibration, q: FloatArray) -> FloatArray:
     """Changes (K, V, m, 2, n) of predicted pixels by a deviation of each reading."""
-    J, sigma_q = joint_derivative(calibration, q), calibration.sigma_q or 0.0
-    chart = FlangeChart.from_optional(calibration.flange_chart)
-    if chart is None:
-        return J * (sigma_q * per_rad(calibration.prismatic))
-    of_places = calibration.sigma_flange_m or 0.0
-    twist = chart.by_twist(q)[:, None, None] * np.where(calibration.prismatic, of_places, sigma_q)
-    return np.asarray(J @ twist)
+    J, chart = joint_derivative(calibration, q), FlangeChart.from_optional(calibration.flange_chart)
+    if chart is not None:
+        J = J @ chart.by_twist(q)[:, None, None]
+    return np.asarray(J * reading_deviations(calibration))
 
 
 def joint_derivative(calibration: Calibration, q: FloatArray) -> FloatArray:

@@ -39,6 +39,7 @@ from projservo_cli.calibration.prediction import (
     pixel_changes,
     predict,
     prediction_variance,
+    reading_deviations,
 )
 from projservo_cli.calibration.robust_fit import MAX_PREDICTED, REFUSE_RATIO, inverse_root
 from projservo_cli.findings import LIMITS, NOTE, REFUSES, Finding, Subject
@@ -139,14 +140,23 @@ class _Images:
         if seen.sigma is not None:
             sigma = np.ones(shape)
             sigma[:, columns] = seen.sigma[:, :, known]
-        some = Observation(seen.pose, seen.marker[known], seen.q, pixels, sigma=sigma, view=c.view)
+        some = Observation(
+            seen.pose,
+            seen.marker[known],
+            seen.q,
+            pixels,
+            sigma=sigma,
+            view=c.view,
+            flange_chart=c.flange_chart,
+        )
         found = Detections.of(some, c.joint_types, c.mount)
         noise = np.full(len(c.view), max(c.sigma_px, c.sigma_fitted_px))
         noise = noise if c.sigma_view_px is None else c.sigma_view_px
         found = dataclasses.replace(found, weight=found.weight / noise[:, None])
         which = np.array([numbers.index(number) for number in found.marker.tolist()], dtype=np.int64)
         problem = LeastSquares.of(found, -c.q_reference[::-1] if c.mount == TOOL else c.q_reference)
-        tau = c.sigma_q * per_rad(found.prismatic) if c.sigma_q else None
+        deviations = reading_deviations(c)
+        tau = (deviations[::-1] if c.mount == TOOL else deviations) if c.sigma_q else None
         return cls(c.with_markers(which), problem.with_noise(tau), which)
 
     def by_camera(self, params: Parameters, v: int) -> FloatArray:

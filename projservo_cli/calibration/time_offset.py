@@ -13,8 +13,8 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.special import stdtrit
 
-from projservo_cli.calibration.detections import MAD, per_rad
-from projservo_cli.calibration.prediction import joint_derivative, predict
+from projservo_cli.calibration.detections import MAD
+from projservo_cli.calibration.prediction import joint_derivative, predict, reading_changes
 from projservo_cli.findings import LIMITS, Finding, Subject
 from projservo_cli.messages import with_findings
 from projservo_cli.records import Calibration, FloatArray, InputError, IntArray, Observation, TimeOffset
@@ -155,7 +155,9 @@ class _Frames:
         J[unseen], r[unseen] = 0.0, 0.0
         J, r = J.reshape(len(q), -1, q.shape[1]), r.reshape(len(q), -1, 1)
         velocity = -J @ q_dot[..., None]
-        G = J * ((found.sigma_q or 0.0) * per_rad(found.prismatic))
+        G = reading_changes(found, q)[:, self.view]
+        G[unseen] = 0.0
+        G = G.reshape(J.shape)
         noise = np.repeat(self.sigma, 2, axis=1)[..., None] ** 2 * np.eye(r.shape[1])
         S = noise + G @ np.swapaxes(G, 1, 2)
         weighted = np.swapaxes(velocity, 1, 2) @ np.linalg.solve(S, np.concatenate([velocity, r], axis=2))

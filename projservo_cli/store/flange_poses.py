@@ -43,7 +43,6 @@ def poses_of(columns: Sequence[str], values: FloatArray, where: Sequence[str]) -
     T = np.tile(np.eye(4), (len(values), 1, 1))
     if "t11" in at:
         T[:, :3] = np.stack([at[name] for name in _MATRIX], axis=1).reshape(-1, 3, 4)
-        _require_rotations(T[:, :3, :3], where)
     else:
         metres = "x" in at
         T[:, :3, 3] = np.stack([at[name] for name in (_METRES if metres else _MILLIMETRES)], axis=1)
@@ -52,13 +51,21 @@ def poses_of(columns: Sequence[str], values: FloatArray, where: Sequence[str]) -
         (_require_quaternions if "qw" in at else _require_vectors)(turns, where)
         R = Rotation.from_quat(turns) if "qw" in at else Rotation.from_rotvec(turns)
         T[:, :3, :3] = R.as_matrix()
+    require_poses(T, where)
+    return T
+
+
+def require_poses(T: FloatArray, where: Sequence[str]) -> None:
+    """Refuse matrices (K, 4, 4) that are no poses in m, with an InputError; ``where`` names each."""
+    for k in np.flatnonzero(~np.isfinite(T).all(axis=(1, 2)))[:1]:
+        raise InputError(f"{where[k]}: holds a number that is not finite; leave such poses out")
+    _require_rotations(T[:, :3, :3], where)
     far = np.abs(T[:, :3, 3]).max(axis=1)
     if far[k := int(np.argmax(far))] > FARTHEST_M:
         raise InputError(
             f"{where[k]}: a position of {far[k]:g} m looks like millimetres: name the columns x_mm, y_mm, "
             "z_mm, or divide by 1000"
         )
-    return T
 
 
 def _require_rotations(R: FloatArray, where: Sequence[str]) -> None:

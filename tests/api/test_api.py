@@ -360,7 +360,10 @@ REFUSED = [
     (lambda c, k, p: ps.plan(c, k, goal=np.zeros((2, 3, 2))), r"\(6,\) joint readings, or \(2, 4, 2\)"),
     (lambda c, k, p: ps.plan(ps.Config.load("stanford"), k), "the configuration of RRPRRR: take one"),
     (lambda c, k, p: ps.servo(c, k, p.q), "servo: plan of type ndarray: make one with plan"),
-    (lambda c, k, p: ps.servo(c, k, p, law="exakt"), "law exakt: no such law; laws: direct_three"),
+    (
+        lambda c, k, p: ps.servo(c, k, p, law="exakt"),
+        "law exakt: no such law; did you mean exact? laws: direct_three",
+    ),
     (lambda c, k, p: ps.servo(c, k, p, law=3), "law 3: expected a name, or a class or function"),
     (lambda c, k, p: ps.sweep(c, laws=[3]), "law 3: expected a name, or a class or function that makes"),
     (lambda c, k, p: ps.servo(c, k, p, mode="follow"), "^servo: mode: .* 'follow' is not one of them; valid"),

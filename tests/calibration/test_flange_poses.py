@@ -12,6 +12,7 @@ from projservo_cli.calibration.pipeline import calibrate
 from projservo_cli.calibration.prediction import predict
 from projservo_cli.geometry.displacements import cross_matrix, rigid, rigid_inverse
 from projservo_cli.geometry.flange import FLANGE_TYPES, FlangeChart
+from projservo_cli.observations import Observations
 from projservo_cli.records import TOOL, WORLD, InputError, Observation, WorkFailed
 from projservo_cli.results import ImageModel
 from projservo_cli.store.observation_tables import read_detections, read_joint_list
@@ -195,3 +196,19 @@ def test_real_poses_are_calibrated_with_their_errors():
     assert found.fit.sigma_fitted_px < 0.1
     assert 5e-4 < found.sigma_q < 2e-3
     assert 1e-4 < found.sigma_flange_m < 1e-3
+
+
+def test_observations_take_poses_and_join_them():
+    """Of two recordings in the coordinates of the first; a matrix that is none is named."""
+    rng = np.random.default_rng(4)
+    T = poses(rng, 12)
+    seen = images(T, WORLD, rng, 0.3)
+    first, second = (
+        Observations.from_arrays(T[at], seen[at], view=["eye"]) for at in (slice(6), slice(6, 12))
+    )
+    both = Observations.concat([first, second])
+    assert (both.joint_types, both.order_stated) == (FLANGE_TYPES, True)
+    np.testing.assert_allclose(FlangeChart.from_record(both.flange_chart).poses(both.q), T, atol=1e-12)
+    T[3, 0, 0] = 2.0
+    with pytest.raises(InputError, match=r"q\[3\]: the rotation"):
+        Observations.from_arrays(T, seen, view=["eye"])

@@ -256,7 +256,7 @@ def test_joint_limits_end_a_run_whatever_is_configured(calibrated):
         ),
         (f"{HERE}:Raising", 1, "failed: IndexError: list index out of range (robots.py:"),
         (f"{HERE}:Nobody", 2, "tests.robots.robots has no Nobody"),
-        ("direct_thre", 2, "no such law; laws: direct_three"),
+        ("direct_thre", 2, "no such law; did you mean direct_three? laws: direct_three"),
     ],
 )
 def test_a_law_that_fails_or_lacks_a_limit(servo, law, code, message):
