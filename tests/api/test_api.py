@@ -362,7 +362,7 @@ REFUSED = [
     (lambda c, k, p: ps.servo(c, k, p.q), "servo: plan of type ndarray: make one with plan"),
     (
         lambda c, k, p: ps.servo(c, k, p, law="exakt"),
-        "law exakt: no such law; did you mean exact? laws: direct_three",
+        r"law exakt: no such law; did you mean exact\? laws: direct_three",
     ),
     (lambda c, k, p: ps.servo(c, k, p, law=3), "law 3: expected a name, or a class or function"),
     (lambda c, k, p: ps.sweep(c, laws=[3]), "law 3: expected a name, or a class or function that makes"),

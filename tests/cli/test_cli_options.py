@@ -108,7 +108,7 @@ USAGE = {
         ["servo", "-c", "tiny.yaml", "--set", "control.laws=[stacked_image_track]"],
         "control.laws.0: is the run of stacked in mode image_track: name stacked, with --set control.mode",
     ),
-    "stage and other": (["calibrate", "validate"], "validate stands alone"),
+    "stage and other": (["calibrate", "validate"], "validate runs alone"),
     "other and stage": (["equations", "calibrate"], "unexpected extra argument (calibrate)"),
     "run twice": (["show", "a", "-o", "b"], "one run"),
     "validate without run": (["validate", "--data", "t.csv"], "needs a run"),
