@@ -3,7 +3,7 @@
 ``DEVIATIONS`` are from the model, over a recording: a calibration tests each by its tangent at the fit, and
 rows with functions of a reading can be fitted (``--joint-model``). ``CHANGES`` are since the calibration: a
 monitor fits each as it changes images. The size of a row is the width of its prior. The sentences, with what
-mends each, are in ``words.calibrations`` and ``words.monitoring``.
+mends each, are in ``messages.calibrations`` and ``messages.monitoring``.
 """
 
 import math
