@@ -12,7 +12,7 @@ from threadpoolctl import threadpool_limits
 
 from projservo_cli.calibration.bundle_adjustment import LeastSquares
 from projservo_cli.calibration.checks.image_contradictions import checked_geometry
-from projservo_cli.calibration.checks.joint_order import require_poses
+from projservo_cli.calibration.checks.joint_order import require_enough_poses
 from projservo_cli.calibration.checks.markers_not_on_tool import (
     motionless,
     motionless_finding,
@@ -195,7 +195,7 @@ def calibrate(
         whole = whole.of_markers(~still)
         require_motion(whole)
         require_no_copies(whole)
-        require_poses(whole)
+        require_enough_poses(whole)
         if image_size is not None:
             _require_inside(whole, image_size, _LENS_STRAYS if lens else _STRAYS)
         require_images(whole, sigma_px)
@@ -344,7 +344,7 @@ def _refined(
             suspicion = of_lens
         elif much and solution.sigma_px > DOUBTED_RATIO * epipolar.noise_px:  # not the joints
             suspicion = Finding("outliers", LIMITS)
-        require_poses(solution.kept().problem.detections)
+        require_enough_poses(solution.kept().problem.detections)
         errors = solution.errors()
         record = _record(
             Projective.of(solution), solution, expected, errors, found, suspicion, limit_px=limit_px

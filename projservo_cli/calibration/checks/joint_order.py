@@ -90,7 +90,7 @@ def _effect(solution: Solution, i: int, j: int) -> float:
     return float(np.median(np.linalg.norm(_change(there, solution.params, order), axis=-1)))
 
 
-def require_poses(detections: Detections) -> None:
+def require_enough_poses(detections: Detections) -> None:
     """Refuse poses that show hardly more of the arm, or of joints in a row, than these have.
 
     With as many numbers as unknowns an arm is one of finitely many, and no residual decides between them: of
