@@ -63,8 +63,8 @@ _OF_STAGES = (
     click.option(
         "--image-size",
         metavar="[NAME=]WxH,...",
-        help="Size of the images, px, or one of each view: by name, or in order (left, right; of a list of "
-        "detections by name, c2 before c10). Default: the order of cameras or rig.",
+        help="Size of all images, px, or of each view, by name or in the order of the views (in a list of "
+        "detections by name, c2 before c10). Default: the size in cameras or rig.",
     ),
     option.force(help="Make the named stages even if they are up to date."),
     option.dry_run,
