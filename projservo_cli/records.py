@@ -1166,7 +1166,7 @@ class RunHistory(RecordPart):
         "time",
         "px",
         "error that decides convergence: the image error of the face, located by the body if "
-        "features is body; of a goal of incidences the least motion of the body's images that meets them",
+        "features is body; of a goal of incidences the minimum motion of the body's images that meets them",
     )
     tau: FloatArray = _array("time", about="translation error, unit-norm kernel of (8)")
     tau_affine: FloatArray = _array("time", about="translation error, scale fixed through a_inf")

@@ -415,7 +415,7 @@ class ImageModel(Displayable, Calibration):
         Raises
         ------
         InputError
-            If a look has another shape, cameras are on the tool or the calibration has no covariance.
+            If an observation has another shape, cameras are on the tool or the calibration has no covariance.
         WorkFailed
             If images or joints do not show the displacement, with the freedom that is missing.
         """

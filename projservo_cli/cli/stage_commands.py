@@ -210,8 +210,8 @@ def _calibrate(stages: Sequence[str], console: Console, **options: Any) -> int:
     calibration as it is and writes suggestions.csv into the folder of the run, for record --motions.
 
     projservo calibrate RUN --refit NAME --data TABLE -o NEW keeps joints, markers and other cameras of RUN,
-    and fits the camera NAME, which moved, again. Exit code 1 if neither enough poses nor another camera
-    confirm the joint readings.
+    and fits the camera NAME, which moved, again. Exit code 1 if the joint readings cannot be
+    confirmed: too few poses, and no other camera.
     """
     if (options["run"] is None) != (options["refit"] is None):
         raise click.UsageError(
@@ -271,7 +271,7 @@ def _servo(stages: Sequence[str], console: Console, **options: Any) -> int:
 
     With --set plant=module:Class (or plant in the configuration) an external robot takes the place of the
     simulated one. It is driven to the start of the task and from there by each law, in every call, and
-    stopped on every way out.
+    always stopped, also on errors and Ctrl-C.
     """
     return _make(console, stages, options)
 

@@ -56,9 +56,8 @@ def _teach(
     joints. A robot that can let go of its arm does so first, if a user at the terminal can move it,
     and then holds it again. A simulated robot is put to --at.
 
-    Checks it against the calibration in RUN, by default the run of the configuration's name in results, where
-    there is one: markers that are off, and whether any joints show it. A goal that none do ends in exit
-    code 1.
+    Checks it against the calibration in RUN, by default the run of the configuration's name in results, if
+    there is one: reports markers that disagree. Exit code 1 if no joints reach the goal.
     """
     from projservo_cli.config import plain_yaml
     from projservo_cli.config.inputs import plan_inputs, teach_inputs
@@ -321,7 +320,7 @@ def _sources(images: tuple[str, ...]) -> dict[str, str]:
     metavar="MM",
     type=option.NumberRange(0.0, 1000.0),
     default=0.0,
-    help="Deviation of the arm that no image shows, a coordinate, beyond the covariance.",
+    help="Additional standard deviation of positions that the images do not cover, per coordinate.",
 )
 @option.joint_unit(help="Unit of the table's revolute joints. Default: the unit of the run.")
 @option.explained

@@ -153,7 +153,8 @@ CALIBRATION = {
         "check whether the file describes this robot and rig",
     ),
     "undecided_order": Row(
-        "the order of {joints} is taken from the table; no pose shows it", "add poses in which several move"
+        "these poses cannot confirm the order of {joints}; the table's order is used",
+        "add poses in which several move",
     ),
     "unseen_poses": Row(
         "poses that no camera saw: {count} ({poses}), dropped", "look why they show no marker"
@@ -268,7 +269,7 @@ CALIBRATION = {
     ),
     "standing_markers": Row(
         "{numbered} {stand} still while the others move: left out",
-        "remove what is not on the tool",
+        "remove markers that are not on the tool",
         limit="markers that stand still",
     ),
     "marker_on_link": Row(
@@ -347,14 +348,14 @@ REFUSALS = {
     "several_joints": Row(
         "the fit rejects {count} of the {total} poses in which several joints move, and {rest} of the "
         "{of_rest} others: no other order of joints explains them, so joints err by more than trials show",
-        "record poses in which all joints move (calibration.random_poses), which tell periodic errors",
+        "record poses in which all joints move (calibration.random_poses), which show periodic errors",
         limit="errors of joints",
     ),
     "erring_joint": Row(
         "{one_of} is off its readings by {amount} rms at {rest} of the {of_rest} poses in which several "
         "joints move, and not in trials of single joints",
         "look at its gear and its encoder, and record poses in which all joints move "
-        "(calibration.random_poses), which tell errors that repeat",
+        "(calibration.random_poses), which show errors that repeat",
         limit="errors of {joints}",
     ),
     "joint_order": Row(

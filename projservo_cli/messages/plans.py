@@ -130,12 +130,12 @@ _NEARER = "show more of its markers, off one line, or show them from nearer"
 # An object that carries a goal; names refer to the frames of it.
 OF_OBJECT = {
     "object_open_infinity": Row(
-        "the joints do not determine the plane at infinity, so nothing tells how far an object has moved",
+        "the joints do not determine the plane at infinity, so the displacement of an object is open",
         "record motions of two joints whose axes are not parallel",
     ),
     "object_without_size": Row(
-        "one camera tells the size of an object from its distance in no number of looks, so not how far it "
-        "has moved",
+        "one camera cannot separate size and distance of an object in any number of frames, so its "
+        "displacement is open",
         "watch it with a second camera",
     ),
     "object_without_shape": Row(

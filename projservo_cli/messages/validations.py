@@ -81,5 +81,5 @@ VALIDATIONS = {
     "other_model": Row(
         "the model does not describe the arm: {model_errors}", "mend it, or check --tip and the known length"
     ),
-    "undecided_model": Row("(or, as the axes do not tell, {model_errors})"),
+    "undecided_model": Row("(or, as the axes do not show, {model_errors})"),
 }

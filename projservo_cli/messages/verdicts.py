@@ -89,7 +89,7 @@ VERDICTS = {
         ends=True,
     ),
     "interrupted": Verdict(
-        "somebody ended it, as with Ctrl-C; its trace up to there is kept", "", ends=True, retried=True
+        "the user ended it, as with Ctrl-C; its trace up to there is kept", "", ends=True, retried=True
     ),
     "not calibrated": Verdict("a run of a sweep has no calibration", "look why it is refused"),
     "not started": Verdict("a run of a sweep could not begin", "read its reason"),

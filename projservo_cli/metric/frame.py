@@ -368,7 +368,7 @@ def _length_of(body: MetricParameters, between: Scale, marker: list[int], prisma
     if between == "joint":
         if not prismatic.any():
             raise InputError(
-                "metric: no joint is prismatic, so none reads metres: give a known length and its ends"
+                "metric: the scale is unknown, since no joint is prismatic: give a known length and its ends"
             )
         return np.asarray(np.linalg.norm(body.axes[..., int(np.argmax(prismatic)), 3:], axis=-1))
     if between == "cameras":

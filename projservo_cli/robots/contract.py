@@ -1,4 +1,4 @@
-"""The contract with a robot: called in one thread, awaited, checked, stopped and closed on every way out."""
+"""The contract with a robot: called in one thread, awaited, checked, and always stopped and closed."""
 
 import math
 import queue
@@ -643,7 +643,7 @@ def _came(orders: "list[Future[Any]]", seconds: float) -> str | None:
 
 @contextmanager
 def at_rest_after(robot: PluginRobot) -> Iterator[None]:
-    """Open a robot; stop and close it on every way out, Ctrl-C, SIGTERM and a lost terminal among them.
+    """Open a robot; always stop and close it, also on Ctrl-C, SIGTERM and a lost terminal.
 
     Raises WorkFailed if it may not be at rest, with the error that ended it.
     """
