@@ -155,7 +155,7 @@ def verdicts() -> Iterator[str]:
     rows = []
     for name, one in VERDICTS.items():
         after = "another path is searched" if one.stopped else ""
-        after = "nothing is driven" if one.ends else after
+        after = "no further motion" if one.ends else after
         rows.append((f"`{name}`", text(one.when), text(one.remedy), after))
     yield from table(("verdict", "cause", "remedy", "then"), rows)
     yield ""

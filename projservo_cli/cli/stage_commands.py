@@ -119,8 +119,8 @@ def _record(stages: Sequence[str], /, console: Console, **options: Any) -> int:
     """Drive the robot through trial motions and write a table.
 
     Drives the robot of a configuration, simulated or yours, through its trial motions (and --motions, whose
-    readings --joint-unit is about), in steps that the joint-speed limit allows, and writes what the cameras
-    see into an observation table for calibrate.
+    readings --joint-unit is about), in steps that the joint-speed limit allows, and writes the images
+    into an observation table for calibrate.
 
     The table grows as the robot goes. After an interruption the same command continues it; a table of another
     configuration is refused, unless --force starts again.
@@ -294,7 +294,7 @@ def _report(stages: Sequence[str], console: Console, *, run: Path | None, **opti
 
     --view adds view.html, a 3D view of robot, rig, face and paths with a time slider, which needs no network;
     it needs pip install '.[view]' and a robot described in metres. --animation adds animation.gif,
-    what the cameras see under the direct and the classical laws. The page links to both; a report that is up
+    the camera images under the direct and the classical laws. The page links to both; a report that is up
     to date is not made again for them.
 
     RUN is short for -o RUN. With the folder of a sweep it writes its statistics and figures instead: success

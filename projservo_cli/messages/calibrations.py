@@ -164,7 +164,7 @@ CALIBRATION = {
     ),
     "few_postures": Row(
         "{count} {postures} show {rest} numbers of the arm, less than the {of_rest} required: several arms "
-        "fit them, and no residual tells which",
+        "fit them, and no residual decides",
         "record {total} or more, better twice as many, in which every joint moves",
     ),
     "joint_undetermined": Row(

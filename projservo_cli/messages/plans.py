@@ -102,7 +102,7 @@ OF_GOAL = {
     "contradictory_incidences": Row(
         "{each} contradict each other: wherever the tool is, its images are {amount} from meeting them, and "
         "noise explains {limit}",
-        "leave one out, or change what they ask",
+        "leave one out, or change one",
     ),
     "unmet_incidences": Row(
         "no joints within their limits meet all incidences; the nearest leave {unshown}",

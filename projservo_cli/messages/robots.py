@@ -192,7 +192,7 @@ ROBOTS: dict[str, Row] = (
         torque_in_part=("torque is on in {servos} alone", "hold the arm"),
         torque_on=("torque is on: the arm holds where it is", "projservo release lets go of it"),
         kept_range=(
-            "{servo} stores limits of its own, {rest} to {of_rest} counts (registers 9 and 11), and was "
+            "{servo} stores other limits, {rest} to {of_rest} counts (registers 9 and 11), and was "
             "moved from {count} to {total}",
             "set them to 0 and 4095 with the tool of its maker, and run projservo limits again",
         ),

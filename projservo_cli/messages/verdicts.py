@@ -154,7 +154,7 @@ REASONS = {
         "backlash, or coarse set-points"
     ),
     "pressed": Row(
-        "the tool is pressed with {amount}, beyond the {limit} of stop.max_force_n", "see what it touches"
+        "the tool is pressed with {amount}, beyond the {limit} of stop.max_force_n", "check its contacts"
     ),
     "moved_object": Row(
         "the object {name}, markers {ends}, has moved since the motion was planned, by {amount} in "

@@ -57,7 +57,7 @@ class Feature(OneOf):
 
     one_of = KINDS
     on: Name = Field(
-        description="what the feature moves with: tool, scene, which is fixed, or the name of an object"
+        description="carrier of the feature: tool, scene, which is fixed, or the name of an object"
     )
     point: Annotated[_Point | Name | None, _numbers_or_name(1, _MOST)] = Field(
         None,

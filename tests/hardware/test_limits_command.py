@@ -118,7 +118,7 @@ def test_all_that_answer_are_released_and_the_others_named(arm, capsys):
 
 @pytest.mark.parametrize(
     ("registers", "said"),
-    [((0, 0), "stores limits of its own, 0 to 0 counts"), ((2500, 4095), "2500 to 4095")],
+    [((0, 0), "stores other limits, 0 to 0 counts"), ((2500, 4095), "2500 to 4095")],
 )
 def test_limits_that_a_servo_stores_are_named_where_they_cut(arm, capsys, registers, said):
     for address, value in zip((9, 11), registers, strict=True):
