@@ -41,9 +41,9 @@ _IN_MOTION, _AT_REST, _BETWEEN_VIEWS = range(3)
 # A corner errs as detections of the calibration from within about this angle, rad; this number of typical
 # ones counts with them.
 _SLANT, _PRIOR_SIGHTINGS = 0.25, 4.0
-# In a view that the calibration has not seen all of them are, by this number.
+# Bias, in deviations of the noise, of all corners in a view that the calibration has not seen.
 _UNUSUAL = 1.0
-# Joints (rad or m) and instants (s) are known no better than this, also if stated.
+# Joints (rad or m) and instants (s) are known no better than this, even if stated better.
 LEAST_ERROR = 1e-6
 # A direction counts if it keeps this share of its size after the others; ridge for solving.
 _RANK, _RIDGE = 1e-6, 1e-9

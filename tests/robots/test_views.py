@@ -275,7 +275,10 @@ def test_cameras_of_the_configuration_have_any_names():
         ("{top: {source: 1}, max_age: 3}", r"cameras.max_age: unknown key; did you mean max_age_s"),
         ("{top: {sorce: 1}}", r"cameras.top.sorce: unknown key; did you mean source"),
         ("{top: {source: 1}, 'Top 2': {source: 2}}", r"cameras.Top 2: is no name of a camera"),
-        ("{top: {source: 1}, low: {source: 1}}", r"cameras.low.source: is .*, that of the top camera"),
+        (
+            "{top: {source: 1}, low: {source: 1}}",
+            r"cameras.low.source: is .*, also the device of the top camera",
+        ),
     ],
 )
 def test_names_that_are_none_are_said(tmp_path, cameras, message):

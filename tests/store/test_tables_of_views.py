@@ -104,5 +104,5 @@ def test_an_error_of_a_list_names_its_line(name, tmp_path):
 
 def test_a_view_that_is_missing_is_named(seen):
     some = of_views(seen, ("left", "top"))
-    with pytest.raises(InputError, match="and the calibration has left, right: add right"):
+    with pytest.raises(InputError, match="the calibration has left, right: add right"):
         of_views(some, ("left", "right"))
