@@ -123,7 +123,7 @@ def test_validate_names_the_one_camera_that_turned_and_what_no_pose_shows(
     told = " ".join(err.split())
     assert "in one camera alone: right camera: median" in told
     assert "--refit right" in told
-    assert "the order of joints 1, 2, 3, 4, 5 and 6 is taken from the table" in told
+    assert "these poses cannot confirm the order of joints 1, 2, 3, 4, 5 and 6" in told
     assert "whether the cameras are on the tool" in told
 
 

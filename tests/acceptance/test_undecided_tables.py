@@ -55,7 +55,7 @@ def test_case_01_joint_order(case, answer, tmp_path):
     assert (code, found["usable"], found["order_determined"]) == (0, True, False)
     assert [1, 3] in found["undecided_order"]
     assert found["advice"][-1].startswith(
-        "the order of joints 1, 2, 3, 4, 5 and 6 is taken from the table; no pose"
+        "these poses cannot confirm the order of joints 1, 2, 3, 4, 5 and 6"
     )
     # With the poses in which several move, the exchanged columns show.
     trials, held = ((folder / name).read_text(encoding="utf-8") for name in ("trials.csv", "held.csv"))
@@ -81,12 +81,12 @@ def test_a_table_without_an_order_is_planned_with_a_warning_and_drives_no_extern
     code, found, err = answer("calibrate", "plan", "-c", UR5, *task, "-o", "run")
     assert code == 0, err
     assert found["calibrate"]["order_determined"] is False
-    assert "; the order of joints 1, 2, 3, 4, 5 and 6 is taken from the table" in found["plan"]["reason"]
+    assert "; these poses cannot confirm the order of joints 1, 2, 3, 4, 5 and 6" in found["plan"]["reason"]
     drive = ["servo", "-c", UR5, *task, "--set", ROBOT, "--law", "exact", "-o", "run"]
     CALLS.clear()
     code, _, err = answer(*drive)
     assert code == 2, err
-    assert "the order of joints 1, 2, 3, 4, 5 and 6 is taken from the table" in err
+    assert "these poses cannot confirm the order of joints 1, 2, 3, 4, 5 and 6" in err
     assert "data.joint_order=stated" in err
     assert not CALLS
     stated = [*drive, "--set", "data.joint_order=stated"]

@@ -36,7 +36,7 @@ def test_single_joint_trials_show_no_order_and_combined_poses_all_of_it(types):
     single, several = trials(robot, 8), around(robot, 4, np.random.default_rng(5))
     none, found = undecided(seen(robot, single))
     assert none == pairs(types)
-    assert order_advice(found).startswith("the order of joints 1, 2")
+    assert order_advice(found).startswith("these poses cannot confirm the order of joints 1, 2")
     assert undecided(seen(robot, np.vstack([single, several])))[0] == []
     # A true arm with its columns in another order fits as well, and its order is as open.
     record = robot.observe(single, 0.3, np.random.default_rng(2))

@@ -159,7 +159,7 @@ def test_a_joint_that_reads_but_stands_still_is_named(sigma):
     still = Q.copy()
     still[:, 3] = Q[0, 3]
     message = refusal(changed(seen(q=still, sigma=sigma), q=Q))
-    assert "joint 4 stands still" in message
+    assert "joint 4 does not move" in message
     assert "60°" in message
 
 
