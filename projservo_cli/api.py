@@ -33,7 +33,7 @@ from projservo_cli.observations import Observations, require_observations
 from projservo_cli.records import Calibration, FloatArray, InputError, JointList, Plan
 from projservo_cli.result_hashes import File
 from projservo_cli.results import ImageModel, MotionPlan, RunTrace
-from projservo_cli.settings.calibration import CalibrationSettings
+from projservo_cli.settings.calibration_and_refits import CalibrationSettings
 from projservo_cli.settings.noise_and_data import Data
 from projservo_cli.stages import Progress
 from projservo_cli.stages import calibrate as calibrating

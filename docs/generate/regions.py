@@ -18,7 +18,7 @@ from projservo_cli.config.schema import json_schema, sweep_schema
 from projservo_cli.laws import FACE_LAWS, INCIDENCES, LAW_SPECS, MODES
 from projservo_cli.loop import verdicts as loop_verdicts
 from projservo_cli.messages import ROWS
-from projservo_cli.messages.verdicts import VERDICTS
+from projservo_cli.messages.verdict_causes import VERDICTS
 from projservo_cli.report.figures import FIGURES
 from projservo_cli.sweeps.runs import BETWEEN, NUMBERED, measured_columns
 

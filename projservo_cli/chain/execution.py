@@ -19,7 +19,7 @@ from projservo_cli.findings import Finding
 from projservo_cli.laws import CODES, codes_of, fault_fails, law_and_mode, must_converge, run_name
 from projservo_cli.loop.jit_notice import compilation
 from projservo_cli.messages import failed, sentence_and_remedy
-from projservo_cli.messages.verdicts import arrived, meaning
+from projservo_cli.messages.verdict_causes import arrived, meaning
 from projservo_cli.observations import Observations
 from projservo_cli.records import InputError, Plan, WorkFailed
 from projservo_cli.result_hashes import digest

@@ -21,11 +21,10 @@ from projservo_cli.config.inputs import (
     servo_inputs,
 )
 from projservo_cli.laws import law_and_mode, run_names
-from projservo_cli.messages.verdicts import meaning
-from projservo_cli.plugin_hashes import source_hash
+from projservo_cli.messages.verdict_causes import meaning
 from projservo_cli.records import InputError
 from projservo_cli.report.figure_inputs import CLAIMS_FILE, PAGE_FILE
-from projservo_cli.result_hashes import key_of
+from projservo_cli.result_hashes import key_of, source_hash
 from projservo_cli.settings.task import TaskStep
 from projservo_cli.store.run_file import SERVO, Result, Run
 

@@ -506,10 +506,8 @@ def _work(console: Console, chain: "Chain", options: Mapping[str, Any]) -> int:
     chain.read()
     _announce(console, chain)
     chain.make()
-    more_values: dict[str, dict[str, Any]] = {
-        "calibrate": {},
-        "report": {},
-    }  # further values of their objects
+    # Further values of their objects.
+    more_values: dict[str, dict[str, Any]] = {"calibrate": {}, "report": {}}
     if (count := options.get("suggest")) is not None and not chain.lacks("calibrate"):
         more_values["calibrate"] = chain.suggestions(count)
     if "calibrate" in chain.names:

@@ -12,7 +12,7 @@ from pydantic import AfterValidator, Field, StringConstraints
 from projservo_cli.image_size import ImageSize
 from projservo_cli.laws import REGULATE
 from projservo_cli.records import LIMITS_MISSING, TOOL, WORLD, InputError, in_unit
-from projservo_cli.settings.calibration import CalibrationSettings
+from projservo_cli.settings.calibration_and_refits import CalibrationSettings
 from projservo_cli.settings.cameras import Cameras
 from projservo_cli.settings.control import Control
 from projservo_cli.settings.disturbance import Disturbance

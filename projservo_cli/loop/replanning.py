@@ -29,7 +29,7 @@ from projservo_cli.loop.verdicts import (
     Log,
     on_plateau,
 )
-from projservo_cli.messages.verdicts import VERDICTS
+from projservo_cli.messages.verdict_causes import VERDICTS
 from projservo_cli.records import FloatArray, Plan
 from projservo_cli.task.face import Task
 

@@ -2,8 +2,8 @@
 
 Of several verdicts at one instant ``verdict_at`` gives the first of ``behind camera``, ``out of view``,
 ``markers lost``, ``converged``, ``diverged``, ``singular``, ``no progress`` or ``max steps``, and ``joint
-limit``; ``loop.python_loop`` states the rules before and after it. ``messages.verdicts`` has their causes. A
-command that would pass a limit is shortened to end there.
+limit``; ``loop.python_loop`` states the rules before and after it, ``messages.verdict_causes`` their causes.
+A command that would pass a limit is shortened to end there.
 
 While markers are lost the robot is held where it is for up to ``max_lost_periods`` periods in a row; the run
 goes on when they are seen again.
@@ -17,7 +17,7 @@ import numpy as np
 from projservo_cli.control.law import LOST, SINGULAR, limit_speed
 from projservo_cli.geometry.jit import merged
 from projservo_cli.geometry.kinematics import beyond_limits, from_border
-from projservo_cli.messages.verdicts import VERDICTS
+from projservo_cli.messages.verdict_causes import VERDICTS
 from projservo_cli.records import VIEWS, FloatArray, IntArray
 from projservo_cli.simulation.analytic_plant import Plant
 

@@ -11,7 +11,7 @@ from projservo_cli.deviations import DEVIATIONS
 from projservo_cli.findings import LIMITS, NOTE, REFUSES, Finding, first, to_columns, usable
 from projservo_cli.messages.placeholders import Wording, quantity
 from projservo_cli.messages.rows_by_code import ROWS, Setup
-from projservo_cli.records import Calibration, CalibrationVerdict, WorkFailed
+from projservo_cli.records import Calibration, CalibrationVerdict, WorkFailed, coordinate_names
 
 _SETUP = Setup()
 # Severities as levels of a table on a robot.
@@ -145,8 +145,8 @@ def order_advice(calibration: Calibration) -> str:
 
 def setup_of(calibration: Calibration) -> Setup:
     """Return the arm and the cameras of a calibration."""
-    by_flange = calibration.flange_chart is not None
-    return Setup(calibration.mount, calibration.view, len(calibration.joint_types), by_flange)
+    names = coordinate_names(calibration.flange_chart)
+    return Setup(calibration.mount, calibration.view, len(calibration.joint_types), names)
 
 
 def _cause(findings: Sequence[Finding]) -> Finding:

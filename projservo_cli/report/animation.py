@@ -13,7 +13,7 @@ from markupsafe import Markup
 from projservo_cli.geometry.kinematics import forward_kinematics
 from projservo_cli.image_size import ImageSize, image_sizes
 from projservo_cli.laws import CLASSICAL_LAWS, PROJECTIVE_LAWS
-from projservo_cli.messages.verdicts import arrived
+from projservo_cli.messages.verdict_causes import arrived
 from projservo_cli.records import BoolArray, ByteArray, FloatArray, InputError, IntArray, Plan, Trace
 from projservo_cli.report import style
 from projservo_cli.report.figure_inputs import PAGE_FILE, title

@@ -13,7 +13,7 @@ from projservo_cli.geometry.kinematics import forward_kinematics, joint_operator
 from projservo_cli.laws import title_of
 from projservo_cli.loop.verdicts import plateau_stretch
 from projservo_cli.messages.placeholders import joined
-from projservo_cli.messages.verdicts import arrived
+from projservo_cli.messages.verdict_causes import arrived
 from projservo_cli.records import FloatArray, Trace
 from projservo_cli.report.figure_inputs import (
     DIRECT,

@@ -16,7 +16,7 @@ from projservo_cli.calibration.checks.observability_and_verdict import WEAK_NOIS
 from projservo_cli.calibration.robust_fit import chi2_band
 from projservo_cli.findings import REACH_M, REACH_RAD
 from projservo_cli.laws import must_converge, run_name
-from projservo_cli.messages.verdicts import arrived
+from projservo_cli.messages.verdict_causes import arrived
 from projservo_cli.records import Plan, Report
 from projservo_cli.report.figure_inputs import ANIMATION_FILE, PAGE_FILE, VIEW_FILE, FigureSpec, title
 from projservo_cli.report.figures import FIGURES

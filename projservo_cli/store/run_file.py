@@ -31,7 +31,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from projservo_cli.findings import LIMITS, NOTE, REFUSES, Finding, from_columns, from_text, sparse
 from projservo_cli.messages import sentence, sentence_and_remedy, setup_of
-from projservo_cli.messages.verdicts import arrived
+from projservo_cli.messages.verdict_causes import arrived
 from projservo_cli.records import (
     SIZES,
     VIEWS,

@@ -17,9 +17,8 @@ from projservo_cli.config.inputs import calibration_inputs
 from projservo_cli.config.settings_and_rules import truth_of
 from projservo_cli.config.sweep import BASE, LAW, Distribution, SweepConfig
 from projservo_cli.laws import law_and_mode, run_names
-from projservo_cli.plugin_hashes import source_hash
 from projservo_cli.records import InputError, IntArray
-from projservo_cli.result_hashes import digest, key_of
+from projservo_cli.result_hashes import digest, key_of, source_hash
 from projservo_cli.settings.sections import JointVector
 from projservo_cli.settings.task import Goal, TaskSettings
 from projservo_cli.simulation.random_tasks import random_tasks

@@ -16,7 +16,7 @@ from projservo_cli.loop.batch import NUMBERS, VERDICT, Batch, Setting
 from projservo_cli.loop.compiled_loop import Course
 from projservo_cli.loop.verdicts import INTERRUPTED, RUNNING, VERDICT_NAMES
 from projservo_cli.messages import sentence_and_remedy
-from projservo_cli.messages.verdicts import VERDICTS
+from projservo_cli.messages.verdict_causes import VERDICTS
 from projservo_cli.records import (
     VIEWS,
     Calibration,

@@ -7,7 +7,7 @@ import pytest
 
 from projservo_cli import records
 from projservo_cli.config.schema import json_schema, sweep_schema
-from projservo_cli.messages.verdicts import VERDICTS
+from projservo_cli.messages.verdict_causes import VERDICTS
 from projservo_cli.sweeps.runs import BETWEEN, NUMBERED, measured_columns
 from tests.documentation.blocks import DOCS
 

@@ -7,8 +7,8 @@ import pytest
 
 from projservo_cli import plugins
 from projservo_cli.config import load_config
-from projservo_cli.plugin_hashes import source_hash
 from projservo_cli.records import InputError
+from projservo_cli.result_hashes import source_hash
 
 UR5 = Path(__file__).parents[2] / "configs" / "ur5.yaml"
 HERE = "tests.robots.robots"

@@ -10,7 +10,7 @@ import pytest
 
 from projservo_cli.findings import usable
 from projservo_cli.messages import with_findings
-from projservo_cli.messages.verdicts import arrived
+from projservo_cli.messages.verdict_causes import arrived
 from projservo_cli.records import InputError, Plan, Trace, changed, flat_fields
 from projservo_cli.results import RunTrace
 from projservo_cli.store import run_file

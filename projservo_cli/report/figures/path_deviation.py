@@ -7,7 +7,7 @@ import numpy as np
 
 from projservo_cli.geometry.kinematics import forward_kinematics
 from projservo_cli.laws import title_of
-from projservo_cli.messages.verdicts import arrived
+from projservo_cli.messages.verdict_causes import arrived
 from projservo_cli.records import FloatArray, Report, Trace
 from projservo_cli.report import style
 from projservo_cli.report.figure_inputs import (

@@ -21,7 +21,7 @@ from projservo_cli.loop.verdicts import (
     tolerance,
 )
 from projservo_cli.messages import text
-from projservo_cli.messages.verdicts import VERDICTS, arrived
+from projservo_cli.messages.verdict_causes import VERDICTS, arrived
 from projservo_cli.monitoring.arrival_accuracy import Posture, rigid_fit
 from projservo_cli.monitoring.innovation_tests import WINDOW
 from projservo_cli.records import (
