@@ -290,6 +290,14 @@ def letters_of(prismatic: Iterable[bool]) -> str:
     return "".join("P" if slides else "R" for slides in prismatic)
 
 
+def coordinate_names(flange_chart: FloatArray | None) -> tuple[str, ...]:
+    """Names of the coordinates of poses of a flange, by their chart (2, 4, 4); none for joints."""
+    if flange_chart is None:
+        return ()
+    turns = (f"the turn about {'xyz'[int(np.argmax(axis))]}" for axis in flange_chart[0, :3, :3].T)
+    return "x", "y", "z", *turns
+
+
 def position_limits(lower: FloatArray, upper: FloatArray) -> JointLimits:
     """Limits (n,) of the positions of joints, rad or m, alone."""
     endless = np.full(len(lower), math.inf)

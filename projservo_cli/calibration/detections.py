@@ -30,6 +30,7 @@ from projservo_cli.records import (
     IntArray,
     Observation,
     WorkFailed,
+    coordinate_names,
     prismatic_of,
 )
 
@@ -120,7 +121,7 @@ class Detections:
             weight[seen] = stated_px / sigma
         q, prismatic = np.array(observation.q, dtype=np.float64), prismatic_of(letters)
         if mount == TOOL:
-            q, prismatic = np.ascontiguousarray(-q[:, ::-1]), prismatic[::-1].copy()
+            q, prismatic = in_chain_order(mount, q), prismatic[::-1].copy()
         present, marker_of_present = np.unique(marker_of, return_inverse=True)
         return cls(
             q=q,
@@ -169,8 +170,7 @@ class Detections:
         """Derivatives (K, 6, 6) of ``q`` by a twist of the flange; None for joints."""
         if self.chart is None:
             return None
-        q = -self.q[:, ::-1] if self.mount == TOOL else self.q
-        by_twist = self.chart.by_twist(q)
+        by_twist = self.chart.by_twist(in_chain_order(self.mount, self.q))
         return -by_twist[:, ::-1, ::-1] if self.mount == TOOL else by_twist
 
     @property
@@ -187,7 +187,13 @@ class Detections:
     @property
     def setup(self) -> Setup:
         """Arm and cameras, for words."""
-        return Setup(self.mount, self.view, self.prismatic.size, self.chart is not None)
+        names = coordinate_names(None if self.chart is None else self.chart.record)
+        return Setup(self.mount, self.view, self.prismatic.size, names)
+
+    def name_of(self, i: int) -> str:
+        """Name of a joint by its column, or of a coordinate of a pose of the flange."""
+        number, names = int(self.numbers[i]), self.setup.coordinates
+        return f"{names[number - 1]} of the flange" if names else f"joint {number}"
 
     @property
     def both(self) -> BoolArray:
@@ -299,6 +305,11 @@ class Detections:
         return np.asarray(self.q[row].copy())
 
 
+def in_chain_order(mount: str, values: FloatArray) -> FloatArray:
+    """Joint values (…, n) in the order and sense of the chain of a mount, or back from these."""
+    return np.ascontiguousarray(-values[..., ::-1]) if mount == TOOL else values
+
+
 def per_block(block_of: IntArray, values: FloatArray, count: int) -> FloatArray:
     """Sums (b, …) of values (N, …) over the observations of each marker or of each pose."""
     sums = [np.bincount(block_of, column, count) for column in values.reshape(len(values), -1).T]
@@ -358,7 +369,7 @@ def require_motion(detections: Detections) -> FloatArray:
     span: FloatArray = np.ptp(detections.q[np.unique(detections.pose_of)], axis=0)
     for i in np.flatnonzero(span <= _MIN_SPAN):
         raise WorkFailed(
-            f"joint {detections.numbers[i]} has no trial motion: it never moves in the data; record poses in "
+            f"{detections.name_of(int(i))} has no trial motion: it never moves in the data; record poses in "
             "which it does"
         )
     return span
@@ -412,7 +423,7 @@ def weak_joints(
     return [finding for _, finding in sorted(found, key=lambda one: one[0])]
 
 
-def require_moved(number: int, span: float, unit: str, motion_px: float, sigma_px: float) -> None:
+def require_moved(name: str, span: float, unit: str, motion_px: float, sigma_px: float) -> None:
     """Refuse a joint if its range moves the images by no more than noise: too short, or it did not follow."""
     if motion_px >= MIN_MOTION * sigma_px:
         return
@@ -422,10 +433,10 @@ def require_moved(number: int, span: float, unit: str, motion_px: float, sigma_p
     reach = REACH_M if unit == "m" else REACH_RAD
     if span < _STANDING * reach:
         needed = quantity(0.5 * reach, unit)
-        advice = f"joint {number} moved only {quantity(span, unit)}: move it at least {needed}"
-        raise WorkFailed(f"too little excitation: the range of joint {number} moves {seen}; {advice}")
+        advice = f"{name} moved only {quantity(span, unit)}: move it at least {needed}"
+        raise WorkFailed(f"too little excitation: the range of {name} moves {seen}; {advice}")
     raise WorkFailed(
-        f"joint {number} does not move: its readings range over {quantity(span, unit)} but "
+        f"{name} does not move: its readings range over {quantity(span, unit)} but "
         f"move {seen}; check that it moved and that its readings are its own, or move a marker off its axis"
     )
 
@@ -513,7 +524,7 @@ def _require_moving(detections: Detections, sigma: float) -> None:
         square = 12.0 * _variances(*_tracks(detections.of_poses(poses))).sum(axis=1)
         path = np.sqrt(max(float(square.mean()) - 24.0 * sigma**2, 0.0)) if square.size else np.inf
         span = float(np.ptp(detections.q[poses, i]))
-        require_moved(int(detections.numbers[i]), span, detections.units[i], path, sigma)
+        require_moved(detections.name_of(i), span, detections.units[i], path, sigma)
 
 
 def _require_all_moving(detections: Detections) -> None:

@@ -100,7 +100,7 @@ _DOUBTFUL_RATIO = 2.0
 _DOUBTFUL_JOINTS = 10.0
 # Maximum share of the noise that a relabelling leaves if it is right, and if data as given are refuted.
 _DOUBTFUL_SHARE, _REFUTED_SHARE = 0.5, 0.2
-# Maximum noise over the noise of a fit as given, for a fit with another type of a joint that images support.
+# Maximum noise of a fit with another type of a joint, over the noise of the fit as given.
 _AS_GOOD = 1.05
 # Minimum share of the squared residuals that makes a lens the likely cause of a misfit.
 _DECISIVE_SHARE = 0.5
@@ -114,7 +114,7 @@ _STRAYS = 0.1
 _LENS_STRAYS = 0.01
 # Distance beyond the border of an image, px, within which a search for corners may place one.
 _BEYOND_PX = 1.0
-# Noise of a camera over the quietest camera from which it is named.
+# Noise of a camera over that of the quietest one, above which a finding names it.
 _NOISY = 2.0
 
 

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from projservo_cli.calibration.detections import per_rad
+from projservo_cli.calibration.detections import in_chain_order, per_rad
 from projservo_cli.geometry.displacements import displacements, sine_and_versine
 from projservo_cli.geometry.flange import FlangeChart
 from projservo_cli.geometry.joint_curve import backwards, basis, slopes, true_joints
@@ -250,12 +250,7 @@ def errors_of(calibration: Calibration) -> Errors:
 
 def from_reference(calibration: Calibration, q: FloatArray) -> FloatArray:
     """Values (K, n) of the joints of its parameters from their reference, at readings (K, n)."""
-    return in_chain_order(calibration, q - calibration.q_reference)
-
-
-def in_chain_order(calibration: Calibration, away: FloatArray) -> FloatArray:
-    """Joint values (…, n) from the reference in the order and sense of its parameters, or back from these."""
-    return np.ascontiguousarray(-away[..., ::-1]) if calibration.mount == TOOL else away
+    return in_chain_order(calibration.mount, q - calibration.q_reference)
 
 
 def _in_reverse(c: Calibration) -> IntArray:

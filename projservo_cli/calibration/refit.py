@@ -26,6 +26,7 @@ from projservo_cli.calibration.detections import (
     Detections,
     cauchy_weights,
     even_choice,
+    in_chain_order,
     per_block,
     per_rad,
 )
@@ -154,7 +155,7 @@ class _Images:
         noise = noise if c.sigma_view_px is None else c.sigma_view_px
         found = dataclasses.replace(found, weight=found.weight / noise[:, None])
         which = np.array([numbers.index(number) for number in found.marker.tolist()], dtype=np.int64)
-        problem = LeastSquares.of(found, -c.q_reference[::-1] if c.mount == TOOL else c.q_reference)
+        problem = LeastSquares.of(found, in_chain_order(c.mount, c.q_reference))
         deviations = reading_deviations(c)
         tau = (deviations[::-1] if c.mount == TOOL else deviations) if c.sigma_q else None
         return cls(c.with_markers(which), problem.with_noise(tau), which)

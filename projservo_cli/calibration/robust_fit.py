@@ -582,9 +582,10 @@ def fit_joint_noise(exact: Solution, expected: Expected, given: float | None) ->
     """
     if given == 0.0 or exact.joint_noise is not None:
         return exact
-    if given is None and exact.problem.detections.chart is not None:
-        return _fit_pose_noise(exact, expected)
+    of_poses = given is None and exact.problem.detections.chart is not None
     sigma_px, solution = None if expected.min_px else expected.sigma_px, exact
+    if of_poses and exact.problem.tau is None:
+        solution = by_usual_noise(exact, expected)
     for _ in range(_NOISE_ROUNDS):
         before = solution.joint_noise
         if given is not None:
@@ -594,17 +595,26 @@ def fit_joint_noise(exact: Solution, expected: Expected, given: float | None) ->
                 solution.problem, solution.params, solution.used, sigma_px, expected.min_px
             )
         if noise.sigma_q == 0.0:
-            return dataclasses.replace(exact, joint_noise=noise)
+            return dataclasses.replace(_without_noise(exact), joint_noise=noise)
         if before is not None and abs(noise.sigma_q - before.sigma_q) <= _NOISE_SETTLED * before.sigma_q:
             break
         found = _with_noise(solution, noise, sigma_px or expected.min_px)
         if found is None:
-            return dataclasses.replace(exact, joint_noise=NO_JOINT_NOISE)
+            return dataclasses.replace(_without_noise(exact), joint_noise=NO_JOINT_NOISE)
         solution = dataclasses.replace(found, joint_noise=noise)
-    alone = given is None and expected.refusal(exact) is None  # else noise of joints is all that explains it
+    # Else noise of joints is all that explains it. No arm reaches a pose exactly, so that one has no rival.
+    alone = given is None and not of_poses and expected.refusal(exact) is None
     if alone and left_out_px(solution) > _NO_WORSE * left_out_px(exact):
         return dataclasses.replace(exact, joint_noise=NO_JOINT_NOISE)
     return solution
+
+
+def _without_noise(solution: Solution) -> Solution:
+    """Fit without noise of joint readings; the same if it has none."""
+    if solution.problem.tau is None:
+        return solution
+    params = dataclasses.replace(solution.params, offsets=None)
+    return fit_inliers(solution.problem.with_noise(None), params, solution.sigma_px) or solution
 
 
 def _with_noise(solution: Solution, noise: JointNoise, min_px: float) -> Solution | None:
@@ -620,26 +630,6 @@ def by_usual_noise(exact: Solution, expected: Expected) -> Solution:
     every = dataclasses.replace(exact, used=exact.problem.detections.seen)
     found = _with_noise(every, noise, expected.min_px)
     return exact if found is None or found.used.sum() < exact.used.sum() else found
-
-
-def _fit_pose_noise(start: Solution, expected: Expected) -> Solution:
-    """Refit with the noise of poses of a flange, which no arm reaches exactly; without if none shows."""
-    sigma_px = None if expected.min_px else expected.sigma_px
-    solution = start if start.problem.tau is not None else by_usual_noise(start, expected)
-    for _ in range(_NOISE_ROUNDS):
-        before, there = solution.joint_noise, (solution.problem, solution.params, solution.used)
-        noise = JointNoise.estimated(*there, sigma_px, expected.min_px)
-        if noise.sigma_q == 0.0:
-            exact = dataclasses.replace(solution.params, offsets=None)
-            found = fit_inliers(solution.problem.with_noise(None), exact, solution.sigma_px)
-            return dataclasses.replace(found or start, joint_noise=noise)
-        if before is not None and abs(noise.sigma_q - before.sigma_q) <= _NOISE_SETTLED * before.sigma_q:
-            break
-        found = _with_noise(solution, noise, sigma_px or expected.min_px)
-        if found is None:
-            break
-        solution = dataclasses.replace(found, joint_noise=noise)
-    return solution
 
 
 def left_out_px(solution: Solution) -> float:

@@ -1,8 +1,9 @@
 """Nonlinear least squares of many small problems at once.
 
 K. Levenberg, Quarterly of Applied Mathematics 2, 1944; D. Marquardt, SIAM Journal 11, 1963. SciPy's solvers
-take one problem at a time. Three solvers stay apart: bundle adjustment eliminates markers, inverse kinematics
-is compiled, and robust fits without damping change their weights at each step.
+take one problem at a time. Other solvers stay apart: bundle adjustment eliminates markers, the body before
+one camera its poses, inverse kinematics is compiled, and robust fits without damping change their weights at
+each step.
 """
 
 from collections.abc import Callable

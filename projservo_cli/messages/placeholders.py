@@ -7,7 +7,7 @@ import numpy as np
 
 from projservo_cli.findings import NOTE, Finding, Subject
 from projservo_cli.messages.rows_by_code import Setup, row_of
-from projservo_cli.messages.verdicts import because
+from projservo_cli.messages.verdict_causes import because
 from projservo_cli.records import CORNERS, LIMITS_MISSING, TOOL
 
 # Digits of a value that is compared with a limit, which may be close.
@@ -34,8 +34,6 @@ _ORIGINS = {
     "stated, by body": "that the sigmas of the markers state, times {amount:.3g} as a rigid body shows",
 }
 
-# Coordinates of a pose of the flange, as joints in their order.
-COORDINATES = "x", "y", "z", "the first turn", "the second turn", "the third turn"
 # Markers that a look at an object needs, and why, by their number; what fewer leave open, by theirs.
 _NEEDED = {
     3.0: "3 off one line",
@@ -108,10 +106,8 @@ def joined(words: Iterable[object]) -> str:
 
 def _joints(told: Wording) -> str:
     everything = (told.one.code == "scale" and not told.single) or not told.joints
-    if told.setup.flange:
-        return (
-            "the flange" if everything else f"{joined(COORDINATES[i - 1] for i in told.joints)} of the flange"
-        )
+    if names := told.setup.coordinates:
+        return "the flange" if everything else f"{joined(names[i - 1] for i in told.joints)} of the flange"
     return "all joints" if everything else numbered("joint", told.joints)
 
 

@@ -146,7 +146,7 @@ def invariant_upgrade(H_hat: FloatArray, prismatic: BoolArray) -> FloatArray:
 
 
 def invariant_form(L: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Form S (…, 3, 3) of positive trace that actions L (…, n, 3, 3) change by a minimum, L S + S Lᵀ.
+    """Form S (…, 3, 3) of positive trace that actions L (…, n, 3, 3) change the least, L S + S Lᵀ.
 
     Also returns the singular values (…, 6) of the changes of all symmetric forms; S is unique if but the last
     is zero.
@@ -324,11 +324,9 @@ def _bodies_by_flange(models: ProjectiveParameters, c: Calibration, chart: Flang
     points = M[..., :3] / M[..., 3:]
     of_cameras, of_markers = (chart.T, np.eye(4)) if c.mount == TOOL else (np.eye(4), chart.T)
     P = models.P @ np.linalg.inv(G)[:, None]
-    depth = (P[:, :, 2] @ homogeneous(points).swapaxes(-1, -2)).mean(axis=-1)
-    side = np.sign(np.linalg.det(P[..., :3]) * depth)
-    if (side[0] < 0.0).any():
+    if (_handedness(P, points)[0] < 0.0).any():
         raise WorkFailed(_MIRRORED)
-    P = P * np.sign(depth)[..., None, None] @ of_cameras
+    P = P @ of_cameras
     P /= np.linalg.norm(P[..., 2, :3], axis=-1)[..., None, None]
     markers = (homogeneous(points) @ rigid_inverse(of_markers).T)[..., :3]
     B = len(P)
@@ -354,13 +352,18 @@ def _right_handed(models: ProjectiveParameters, G: FloatArray) -> tuple[FloatArr
     M = models.M @ G.swapaxes(-1, -2)
     points = M[..., :3] / M[..., 3:]
     P = models.P @ np.linalg.inv(G)[:, None]
-    depth = (P[:, :, 2] @ homogeneous(points).swapaxes(-1, -2)).mean(axis=-1)
-    side = np.sign(np.linalg.det(P[..., :3]) * depth)
+    side = _handedness(P, points)
     if (side[0] != side[0, 0]).any():
         raise WorkFailed(_MIRRORED)
     flip = np.ones((len(G), 4))
     flip[:, 0] = side[:, 0]
     return flip[:, :, None] * G, points * flip[:, None, :3]
+
+
+def _handedness(P: FloatArray, points: FloatArray) -> FloatArray:
+    """Signs (B, V) of frames by cameras (B, V, 3, 4) with points (B, m, 3) in front, 1 for right-handed."""
+    depth = (P[:, :, 2] @ homogeneous(points).swapaxes(-1, -2)).mean(axis=-1)
+    return np.asarray(np.sign(np.linalg.det(P[..., :3]) * depth))
 
 
 def _length_of(body: MetricParameters, between: Scale, marker: list[int], prismatic: BoolArray) -> FloatArray:

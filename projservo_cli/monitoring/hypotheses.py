@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, expm
 
-from projservo_cli.calibration.prediction import Parameters, from_reference, in_chain_order
+from projservo_cli.calibration.detections import in_chain_order
+from projservo_cli.calibration.prediction import Parameters, from_reference
 from projservo_cli.deviations import CHANGES, Deviation
 from projservo_cli.geometry.least_squares import Equations, levenberg_marquardt
 from projservo_cli.image_size import FACTORS
@@ -107,7 +108,7 @@ class Evidence:
         self.scene: Parameters = errors.scene
         q = np.array([pair.q for pair in self.pairs])
         away = from_reference(errors.calibration, q.reshape(-1, q.shape[-1]))
-        self.away = in_chain_order(errors.calibration, away).reshape(q.shape)
+        self.away = in_chain_order(errors.calibration.mount, away).reshape(q.shape)
         self._images = np.array([pair.images for pair in self.pairs])
         self.seen = np.array([residual.seen for residual in residuals])
         self._images[~self.seen] = 0.0
@@ -159,7 +160,7 @@ class Evidence:
             lens=changed.lens,
             curve=self.scene.curve,
         )
-        away, own = in_chain_order(self._errors.calibration, changed.away), np.arange(V)
+        away, own = in_chain_order(self._errors.calibration.mount, changed.away), np.arange(V)
         s = scene.predict(away.reshape(V * K, n)).reshape(K, V, V, -1, 2)[:, own, own]
         s = changed.scale[:, None, None] * (s + 0.5) - 0.5 + changed.shift[:, None]
         off = np.where(np.isfinite(s), self._images - s, _HIDDEN_PX)

@@ -30,6 +30,7 @@ from projservo_cli.records import (
     Observation,
     WorkFailed,
     changed,
+    coordinate_names,
 )
 from projservo_cli.simulation.random_streams import NORMAL, SUGGESTIONS, generator
 from projservo_cli.stages import Progress, silent
@@ -174,8 +175,8 @@ def estimate(
             calibration = fitted_to(board.observation)
     except WorkFailed as error:
         found = [*screening.findings, *board.findings]
-        by_flange = seen.flange_chart is not None
-        setup = Setup(seen.mount, board.observation.view, len(seen.joint_types), by_flange)
+        names = coordinate_names(seen.flange_chart)
+        setup = Setup(seen.mount, board.observation.view, len(seen.joint_types), names)
         words, findings = "; ".join((str(error), *lines(found, setup))), (*error.findings, *found)
         raise type(error)(words, findings=findings) from error
     calibration = changed(

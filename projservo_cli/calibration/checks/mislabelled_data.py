@@ -18,7 +18,7 @@ from projservo_cli.calibration.bundle_adjustment import LeastSquares, minimize
 from projservo_cli.calibration.checks.image_contradictions import size_changes
 from projservo_cli.calibration.checks.outliers import Outliers
 from projservo_cli.calibration.checks.unusable_fit import unexplained
-from projservo_cli.calibration.detections import Detections, even_choice
+from projservo_cli.calibration.detections import Detections, even_choice, in_chain_order
 from projservo_cli.calibration.initial.initialization import Search, bodies, starting_markers, starts
 from projservo_cli.calibration.robust_fit import Solution, fit_from
 from projservo_cli.findings import REFUSES, Finding, Subject
@@ -84,9 +84,7 @@ class _Data(NamedTuple):
             off = np.linalg.norm(there.residual(dataclasses.replace(found.params, offsets=None)), axis=2)
             square = np.log(np.square(off / found.sigma_px).sum(axis=0) + 1.0)
             levels.append(np.bincount(d.pose_of, square, K))
-        left = (
-            np.cumsum(levels[0]) + np.cumsum(levels[1][::-1])[::-1]
-        )  # levels of the poses around each onset
+        left = np.cumsum(levels[0]) + np.cumsum(levels[1][::-1])[::-1]  # around each onset
         at = 1 + int(np.argmin(left[:-1] - levels[1][:-1]))
         return self.shifted(one.finding.code, min(at, K - 2))
 
@@ -117,8 +115,8 @@ class _Data(NamedTuple):
 def _mounts(data: _Data) -> Iterator[Relabelling]:
     """Cameras on the tool that are given as fixed, or the other way round."""
     d = data.detections
-    other, q = TOOL if d.mount == WORLD else WORLD, np.ascontiguousarray(-d.q[:, ::-1])
-    q_0 = -data.q_reference[::-1]
+    other, q = TOOL if d.mount == WORLD else WORLD, in_chain_order(TOOL, d.q)
+    q_0 = in_chain_order(TOOL, data.q_reference)
     yield data.with_(
         "other_mount", Subject(name=other), q_0=q_0, mount=other, q=q, prismatic=d.prismatic[::-1]
     )
@@ -237,10 +235,10 @@ def _sizes(data: _Data) -> Iterator[Relabelling]:
 
 def _poses(data: _Data) -> Iterator[Relabelling]:
     """Poses of the base in the flange, rotations by columns, or quaternions with w first."""
-    d, chart = data.detections, data.detections.chart
-    assert chart is not None
-    sense = -1.0 if d.mount == TOOL else 1.0
-    T = chart.poses(sense * d.q[:, :: int(sense)])
+    d = data.detections
+    if d.chart is None:
+        return
+    T = d.chart.poses(in_chain_order(d.mount, d.q))
     R = Rotation.from_matrix(T[:, :3, :3])
     for code, other in (
         ("inverse_poses", rigid_inverse(T)),
@@ -248,7 +246,7 @@ def _poses(data: _Data) -> Iterator[Relabelling]:
         ("scalar_first", _with_rotations(T, Rotation.from_quat(np.roll(R.as_quat(), -1, axis=1)))),
     ):
         there = FlangeChart.of(other)
-        q = np.ascontiguousarray(sense * there.coordinates(other)[:, :: int(sense)])
+        q = in_chain_order(d.mount, there.coordinates(other))
         yield data.with_(code, Subject(), q=q, chart=there)
 
 

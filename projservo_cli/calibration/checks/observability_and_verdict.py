@@ -342,5 +342,5 @@ def _require_joints_seen(solution: Solution, sigma_px: float) -> FloatArray:
     rate = there.joint_derivative(solution.params)
     motion = np.linalg.norm(rate, axis=2).mean(axis=(0, 1)) * span
     i = int(np.argmin(motion))
-    require_moved(int(detections.numbers[i]), float(span[i]), detections.units[i], float(motion[i]), sigma_px)
+    require_moved(detections.name_of(i), float(span[i]), detections.units[i], float(motion[i]), sigma_px)
     return span

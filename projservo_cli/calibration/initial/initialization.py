@@ -84,10 +84,6 @@ _RIDGE = 0.03
 _MIN_SCALE = 1e-3
 # Angle of a rotation, rad, above which noise may turn its vector over.
 _HALF_TURN = 2.8
-# Root mean square rotation across the main axis, rad, below which poses turn about one axis.
-_SAME_AXIS = 0.03
-# Turns of the base that are tried where no pose turns.
-_ALL_TURNS = Rotation.create_group("O").as_matrix()
 
 
 def stationary(detections: Detections, noise_px: float) -> BoolArray:
@@ -403,8 +399,8 @@ def starts(
     for factor in factors:
         for body in bodies(search, detections, factor) if known is None else known:
             some, rigid = detections.rows(body.placed), np.isfinite(body.alignment.body[:, 0])
-            if some.chart is not None:
-                yield from _of_flange(body, some, rigid)
+            if (known_operators := some.known_operators) is not None:
+                yield from _of_flange(body, some, known_operators)
                 continue
             for w in _rotation_axes(body.alignment, search.problem.q, some.prismatic, search.rng):
                 params = _solve_points(w, (body.P, body.points), some, search.problem.q, rigid)
@@ -412,25 +408,21 @@ def starts(
                     yield params
 
 
-def _of_flange(body: GuessedBody, detections: Detections, rigid: BoolArray) -> Iterator[Parameters]:
-    """Yield initial parameters in the base by poses of the flange.
+def _of_flange(body: GuessedBody, detections: Detections, H_hat: FloatArray) -> Iterator[Parameters]:
+    """Yield initial parameters in the base by poses of the flange, of known operators (6, 4, 4).
 
     The turn of the base follows from the rotations in closed form; points are linear in its place and scale.
-    Without rotations about two axes several turns are tried, best first.
     """
-    H_hat, q, prismatic = detections.known_operators, detections.q, detections.prismatic
-    assert H_hat is not None
-    motion = reduce(np.matmul, displacements(H_hat, prismatic, q))
-    found = [
-        _placed_in_base(C, motion, (body.P, body.points), detections, rigid)
-        for C in _turns_of_base(motion[:, :3, :3], body.alignment)
-    ]
-    for _, (P, M) in sorted((one for one in found if one is not None), key=lambda one: one[0]):
-        yield Parameters(P, H_hat, prismatic, M, known_arm=True)
+    motion = reduce(np.matmul, displacements(H_hat, detections.prismatic, detections.q))
+    C = _turn_of_base(motion[:, :3, :3], body.alignment)
+    rigid = np.isfinite(body.alignment.body[:, 0])
+    found = _placed_in_base(C, motion, (body.P, body.points), detections, rigid)
+    if found is not None:
+        yield Parameters(found[0], H_hat, detections.prismatic, found[1], known_arm=True)
 
 
-def _turns_of_base(D: FloatArray, alignment: _Alignment) -> Iterator[FloatArray]:
-    """Yield rotations (3, 3) of the base into the frame of an alignment, by those of the flange (K, 3, 3).
+def _turn_of_base(D: FloatArray, alignment: _Alignment) -> FloatArray:
+    """Rotation (3, 3) of the base into the frame of an alignment, by rotations of the flange (K, 3, 3).
 
     Rotation vectors of the flange and of the body between two poses are equal but for this rotation.
     Source: F. C. Park, B. J. Martin, "Robot sensor calibration: solving AX = XB on the Euclidean group",
@@ -439,22 +431,15 @@ def _turns_of_base(D: FloatArray, alignment: _Alignment) -> Iterator[FloatArray]
     known = np.flatnonzero(alignment.merged)
     a, b = (known[at] for at in np.triu_indices(len(known), 1))
     flange, body = (_rotation_vectors(R[a] @ R[b].swapaxes(1, 2)) for R in (D, alignment.R))
-    angle = np.linalg.norm(flange, axis=1)
-    used = angle < _HALF_TURN
+    used = np.linalg.norm(flange, axis=1) < _HALF_TURN
     flange, body, weight = flange[used], body[used], np.ones(np.count_nonzero(used))
+    C = np.eye(3)
     for _ in range(_ROUNDS):
         U, _, Vt = np.linalg.svd(body.T @ (weight[:, None] * flange))
         C = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
         off = np.linalg.norm(body - flange @ C.T, axis=1)
         weight = cauchy_weights((off / (2.0 * robust_deviation(off, _WIDTH))) ** 2)
-    values, vectors = np.linalg.eigh((weight[:, None] * flange).T @ flange / max(weight.sum(), 1e-12))
-    if values[1] > _SAME_AXIS**2:
-        yield C
-    elif values[2] > _SAME_AXIS**2:
-        for angle in np.arange(0.0, 2.0 * np.pi, np.pi / 8.0):
-            yield C @ _rotations(angle * vectors[:, 2])
-    else:
-        yield from np.asarray(_ALL_TURNS)
+    return np.asarray(C)
 
 
 def _placed_in_base(
@@ -463,8 +448,8 @@ def _placed_in_base(
     guess: tuple[FloatArray, FloatArray],
     detections: Detections,
     rigid: BoolArray,
-) -> tuple[float, tuple[FloatArray, FloatArray]] | None:
-    """Median distance, and cameras and markers in the base; None if the scale is not positive.
+) -> tuple[FloatArray, FloatArray] | None:
+    """Cameras and markers in the base, by its turn C (3, 3); None if the scale is not positive.
 
     A point of marker j at pose k is s C (R_k X_j + d_k) + t. Turned back by C R_k, the unknown s X_j is the
     mean of the remaining residuals.
@@ -478,10 +463,9 @@ def _placed_in_base(
     x, X = _robust_solve(rows, target, np.full(4, 1e-9 * len(points)), marker_of, rigid)
     if not x[0] > 0.0:
         return None
-    off = np.linalg.norm(target - (rows @ x) - X[marker_of], axis=1)
     frame = np.eye(4)
     frame[:3, :3], frame[:3, 3] = x[0] * C, x[1:] + center
-    return float(np.median(off)), (P @ frame, homogeneous(X / x[0]))
+    return P @ frame, homogeneous(X / x[0])
 
 
 @dataclass(frozen=True, eq=False)
