@@ -7,7 +7,9 @@ when they run.
 # The order of the commands in the help.
 # isort: off
 from projservo_cli.cli import stage_commands
-from projservo_cli.cli import teach_detect_validate
+from projservo_cli.cli import teach
+from projservo_cli.cli import detect
+from projservo_cli.cli import validate
 from projservo_cli.cli import tags_doctor
 from projservo_cli.cli import show_compare_export
 from projservo_cli.cli import init_schema_bench
@@ -18,6 +20,7 @@ from projservo_cli.cli.program import main, run
 # isort: on
 
 __all__ = [
+    "detect",
     "init_schema_bench",
     "limits_release",
     "main",
@@ -26,5 +29,6 @@ __all__ = [
     "stage_commands",
     "sweep_command",
     "tags_doctor",
-    "teach_detect_validate",
+    "teach",
+    "validate",
 ]

@@ -74,7 +74,7 @@ def _tags(
     """
     import numpy as np
 
-    from projservo_cli.detection import TagFinder
+    from projservo_cli.detection.finders import TagFinder
     from projservo_cli.hardware import tag_sheets as sheets
     from projservo_cli.settings.markers import GROUND, Markers
     from projservo_cli.store.files_and_locks import write_whole

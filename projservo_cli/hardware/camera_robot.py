@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from projservo_cli import messages
-from projservo_cli.detection import Corners, Finder
+from projservo_cli.detection.finders import Corners, Finder
 from projservo_cli.findings import LIMITS, REFUSES, Finding, Subject
 from projservo_cli.hardware.video_cameras import Frame, VideoCamera
 from projservo_cli.records import ByteArray, FloatArray, WorkFailed

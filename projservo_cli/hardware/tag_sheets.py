@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from projservo_cli.detection import TagFinder
+from projservo_cli.detection.finders import TagFinder
 from projservo_cli.records import FloatArray, InputError
 
 if TYPE_CHECKING:

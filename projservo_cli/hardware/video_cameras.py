@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from projservo_cli import messages
-from projservo_cli.detection import opencv, unfit
+from projservo_cli.detection.images import opencv, unfit
 from projservo_cli.findings import LIMITS, REFUSES, Finding, Subject
 from projservo_cli.passwords import masked
 from projservo_cli.records import ByteArray, InputError, WorkFailed

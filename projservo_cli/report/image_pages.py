@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from projservo_cli.detection import opencv
+from projservo_cli.detection.images import opencv
 from projservo_cli.records import CORNERS, ByteArray, FloatArray
 from projservo_cli.report.html import embedded, html_page
 

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field, PlainValidator, Strict, WithJsonSchema
 from scipy.spatial.transform import Rotation
 
-from projservo_cli.detection import LEAST_ROWS, Board
+from projservo_cli.detection.finders import LEAST_ROWS, Board
 from projservo_cli.records import CORNERS, FloatArray
 from projservo_cli.settings.sections import Note, Pose, Positive, Section, Text, Vector3, Whole
 

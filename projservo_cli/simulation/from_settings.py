@@ -9,7 +9,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from projservo_cli.detection import DICTIONARY
+from projservo_cli.detection.finders import DICTIONARY
 from projservo_cli.geometry.displacements import twists
 from projservo_cli.image_size import image_sizes
 from projservo_cli.records import TOOL, FloatArray, no_lenses, position_limits, prismatic_of

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from scipy.linalg import rq
 from scipy.spatial.transform import Rotation
 
-from projservo_cli.detection import TagFinder
+from projservo_cli.detection.finders import TagFinder
 from projservo_cli.geometry.lens import undistort
 from projservo_cli.records import CORNERS, VIEWS, ByteArray, FloatArray, InputError, IntArray
 from projservo_cli.result_hashes import File

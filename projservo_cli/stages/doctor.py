@@ -9,7 +9,7 @@ import numpy as np
 
 from projservo_cli import messages
 from projservo_cli.calibration.refit import ViewError, view_errors
-from projservo_cli.detection import DICTIONARY, finder_of
+from projservo_cli.detection.finders import DICTIONARY, finder_of
 from projservo_cli.findings import LIMITS, NOTE, REFUSES, Finding, Subject, from_text, usable
 from projservo_cli.hardware.camera_robot import CameraRobot, View
 from projservo_cli.hardware.checks_at_rest import RobotAtRest, findings_at_rest

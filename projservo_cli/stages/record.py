@@ -14,7 +14,7 @@ import numpy as np
 
 from projservo_cli import messages
 from projservo_cli.calibration.detections import per_rad
-from projservo_cli.detection import DICTIONARY, MIN_CELL, cells_of
+from projservo_cli.detection.finders import DICTIONARY, MIN_CELL, cells_of
 from projservo_cli.findings import NOTE, REFUSES, Finding, Subject
 from projservo_cli.hardware.checks_at_rest import MIN_SHARED
 from projservo_cli.messages.rows_by_code import Setup

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from projservo_cli.detection import Board
+from projservo_cli.detection.finders import Board
 from projservo_cli.image_size import ImageSize
 from projservo_cli.records import TOOL, Calibration, FloatArray, InputError, JointLimits
 from projservo_cli.result_hashes import File, digest, encoded

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from projservo_cli.detection import Board, BoardFinder, finder_of
+from projservo_cli.detection.finders import Board, BoardFinder, finder_of
 from projservo_cli.settings.markers import BoardSettings, Markers
 from projservo_cli.store.observation_tables import read_table
 from tests.calibration.simulated_robot import Robot, around, random_robot

@@ -6,9 +6,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from projservo_cli.config import load_config
-from projservo_cli.detection import TagFinder
+from projservo_cli.detection.finders import TagFinder
+from projservo_cli.detection.images import ImageFile
+from projservo_cli.geometry.flange import FlangeChart
 from projservo_cli.records import InputError
 from projservo_cli.store.observation_tables import read_table
 from tests.configured import trial_motions, truth_of
@@ -173,13 +176,26 @@ def test_images_and_readings_belong_together(projservo, monkeypatch, name):
     joints(*rows)
     Path("l/notes.txt").write_text("no image")
     read = []
-    original = TagFinder.read
-    monkeypatch.setattr(TagFinder, "read", lambda self, path: read.append(path.stem) or original(self, path))
+    original = ImageFile.grey
+    monkeypatch.setattr(ImageFile, "grey", lambda self: read.append(self.path.stem) or original(self))
     answer = projservo("detect", "l/*.png", "r", "--readings", "q.csv", "-o", "t.csv")
     assert answer.code == 0, answer.err
     table = read_table("t.csv")
     assert (table.pose.tolist(), table.q[:, 0].tolist()) == (poses, readings)
     assert read == images.split()
+
+
+def test_poses_of_the_flange_are_paired_like_joint_readings(projservo):
+    put(["l/a1.png", "l/a2.png"])
+    joints("pose,x_mm,y_mm,z_mm,rx,ry,rz", "2,100,200,300,0.1,-0.2,0.3", "1,-100,50,400,-1.5,0,0.7")
+    answer = projservo("detect", "top=l", "--readings", "q.csv", "-o", "t.csv")
+    assert answer.code == 0, answer.err
+    table = read_table("t.csv")
+    assert table.pose.tolist() == [2, 1]
+    poses = FlangeChart.from_record(table.flange_chart).poses(table.q)
+    np.testing.assert_allclose(poses[:, :3, 3], [[0.1, 0.2, 0.3], [-0.1, 0.05, 0.4]], atol=1e-9)
+    vectors = Rotation.from_matrix(poses[:, :3, :3]).as_rotvec()
+    np.testing.assert_allclose(vectors, [[0.1, -0.2, 0.3], [-1.5, 0.0, 0.7]], atol=1e-9)
 
 
 @pytest.mark.parametrize("view", [("top",), ("top", "left", "low")])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from projservo_cli.detection import refine_corners
+from projservo_cli.detection.finders import refine_corners
 
 FACTOR = 10
 

@@ -11,7 +11,7 @@ import pytest
 
 pytest.importorskip("cv2")
 
-from projservo_cli.detection import TagFinder
+from projservo_cli.detection.finders import TagFinder
 from projservo_cli.findings import Subject
 from projservo_cli.hardware import video_cameras
 from projservo_cli.hardware.camera_robot import CameraRobot

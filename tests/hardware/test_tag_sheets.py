@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from projservo_cli.detection import TagFinder
+from projservo_cli.detection.finders import TagFinder
 from projservo_cli.hardware import tag_sheets
 
 pdfium = pytest.importorskip("pypdfium2")

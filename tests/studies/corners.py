@@ -69,7 +69,7 @@ def finders():
     """What each finder makes of an image: corners (4, 2) and stated deviations (4,), or None."""
     import cv2
 
-    from projservo_cli.detection import TagFinder
+    from projservo_cli.detection.finders import TagFinder
 
     fine, dictionary = TagFinder("4X4_50"), cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
     rough = cv2.aruco.ArucoDetector(dictionary)

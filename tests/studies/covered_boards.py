@@ -14,7 +14,7 @@ import time
 import cv2
 import numpy as np
 
-from projservo_cli.detection import Board, BoardFinder
+from projservo_cli.detection.finders import Board, BoardFinder
 from tests.detection.boards import SIZE, drawn, view_of
 from tests.studies.common import in_two_processes, parser_of, quantiles, rate, write_rows
 

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from projservo_cli.detection import Board, BoardFinder, TagFinder
+from projservo_cli.detection.finders import Board, BoardFinder, TagFinder
 from projservo_cli.records import BoolArray, FloatArray
 from tests.detection.boards import drawn, view_of
 from tests.detection.rendering import render

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 
 from projservo_cli import messages, plugins
-from projservo_cli.detection import finder_of
+from projservo_cli.detection.finders import finder_of
 from projservo_cli.findings import REFUSES, Finding, Subject
 from projservo_cli.hardware.camera_robot import Arm, CameraRobot
 from projservo_cli.passwords import MASK

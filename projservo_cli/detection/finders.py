@@ -1,33 +1,27 @@
 """Marker detection in images: corners of ArUco and AprilTag tags, and of boards, to a fraction of a pixel.
 
-It pairs images with joint readings, finds tags by OpenCV, refines their corners, and collects all images.
+OpenCV finds tags and boards; edges refine their corners.
 """
 
 import math
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import ndtr
 
-from projservo_cli import messages
+from projservo_cli.detection.images import StoredImage, opencv
 from projservo_cli.findings import REFUSES, Finding, Subject
 from projservo_cli.geometry.least_squares import Equations, levenberg_marquardt
-from projservo_cli.image_size import natural
-from projservo_cli.messages.rows_by_code import Setup
 from projservo_cli.records import (
     CORNERS,
     BoolArray,
     ByteArray,
     FloatArray,
     InputError,
-    JointList,
-    Observation,
     board_numberings,
 )
 
@@ -43,101 +37,6 @@ def cells_of(dictionary: str) -> int:
     return 2 + (int(code[1]) if code[2] == "X" else math.isqrt(int(code[1])))
 
 
-_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp"})
-
-
-def pair_images(
-    sources: Mapping[str, str], joints: JointList, where: str
-) -> list[tuple[int, *tuple[Path, ...]]]:
-    """Pair images with poses: number and the images of every pose, one of each view.
-
-    sources : by the name of each view, a folder, or a pattern such as ``left/*.png``.
-    joints : the poses. Images are found by their names in the list, otherwise by the pose number at the end
-    of
-        their names, or in the order of their names.
-    where : file of the poses, for messages.
-    Raises InputError if there are no images, or the image of a pose is missing or ambiguous.
-    """
-    poses = joints.pose.tolist()
-    columns = f"column{'s' * (len(sources) > 1)} {' and '.join(sources)}"
-    if joints.images is not None:
-        sides = [_named(side, joints.images[name], where) for name, side in sources.items()]
-    elif joints.numbered:
-        sides = [_by_number(side, poses, where, columns) for side in sources.values()]
-    else:
-        sides = [_images(side) for side in sources.values()]
-        for side, files in zip(sources.values(), sides, strict=True):
-            if len(files) != len(poses):
-                raise InputError(
-                    f"{side}: {len(files)} images for the {len(poses)} rows of {where}; name the images in "
-                    f"{columns}, or number the rows in a column pose"
-                )
-    return list(zip(poses, *sides, strict=True))
-
-
-def _images(source: str) -> list[Path]:
-    """Images of a folder or pattern, in the order of their names, 2 before 10."""
-    files = [file for file in _images_or_not(source) if not file.name.startswith(".")]
-    if not files:
-        kinds = " ".join(sorted(suffix[1:] for suffix in _SUFFIXES))
-        raise InputError(f"{source}: no images there; give a folder or a quoted pattern of files ({kinds})")
-    return sorted(files, key=lambda file: (natural(file.stem), file.name))
-
-
-def hidden_images(source: str) -> list[Path]:
-    """Hidden files of a folder or pattern with names of images, as macOS writes next to each; no images."""
-    return [file for file in _images_or_not(source) if file.name.startswith(".")]
-
-
-def _images_or_not(source: str) -> list[Path]:
-    """Files of a folder or pattern with names of images."""
-    pattern = Path(source, "*") if Path(source).is_dir() else Path(source)
-    named = [file for file in pattern.parent.glob(pattern.name) if file.suffix.lower() in _SUFFIXES]
-    return [file for file in named if file.is_file()]
-
-
-def unfit(image: Any) -> Finding | None:
-    """Tell why an image as it was read shows no grey values of a scene; None if it does."""
-    if image.dtype != np.uint8:
-        return Finding("deep_pixels", REFUSES, amount=8 * image.dtype.itemsize, limit=8)
-    if image.ndim > 2 or min(image.shape) < 2:
-        return None
-    even = image[: image.shape[0] // 2 * 2, : image.shape[1] // 2 * 2]
-    cells = even.reshape(len(even) // 2, 2, -1, 2).mean(axis=(0, 2), dtype=np.float64)
-    if np.ptp(cells) > max(1.0, _MOSAIC * cells.mean()):
-        return Finding("mosaic", REFUSES)
-    return None
-
-
-def _named(source: str, names: Sequence[str], where: str) -> list[Path]:
-    folder = Path(source) if Path(source).is_dir() else Path(source).parent
-    files = [folder / name for name in names]
-    for file in files:
-        if not file.is_file():
-            raise InputError(f"{file}: there is no such image, though {where} names it")
-        if files.count(file) > 1:
-            raise InputError(f"{file}: {where} names it in {files.count(file)} rows; an image shows one pose")
-    return files
-
-
-def _by_number(source: str, poses: list[int], where: str, columns: str) -> list[Path]:
-    files, chosen = _images(source), []
-    for pose in poses:
-        fitting = [file for file in files if [*map(int, re.findall(r"\d+", file.stem))][-1:] == [pose]]
-        if len(fitting) != 1:
-            names = ", ".join(file.name for file in fitting)
-            ending = f"the names of {names} end" if fitting else "no image has a name that ends"
-            raise InputError(
-                f"{source}: {ending} in {pose}, the pose of {where}; name the images in {columns}, "
-                "or leave the column pose out to take them in the order of their names"
-            )
-        chosen += fitting
-    return chosen
-
-
-# Share of the mean grey value by which the values of the four pixels of a cell of a Bayer mosaic differ at
-# least.
-_MOSAIC = 0.04
 # Kinds of boards, and their minimum rows and columns.
 _BOARDS, LEAST_ROWS = ("chessboard", "charuco"), 3
 # Share of a square that a tag takes up on a ChArUco board: as OpenCV draws it; the edges decide on corners.
@@ -520,32 +419,13 @@ class Finder(ABC):
         """Return tags numbered as in the frame before, if a board looks the same from several ends."""
         return tags
 
-    def absent(self, paths: Sequence[Path]) -> Finding:
+    def absent(self, shown: Sequence[StoredImage]) -> Finding:
         """Return that there is nothing in images of files."""
-        return Finding("no_tags", REFUSES, amount=len(paths), unit="1")
+        return Finding("no_tags", REFUSES, amount=len(shown), unit="1")
 
-    def mirrored(self, paths: Sequence[Path]) -> int:
+    def mirrored(self, shown: Sequence[StoredImage]) -> int:
         """Number of images of files that show something when they are mirrored."""
-        return sum(bool(self.find(np.fliplr(self.read(path)))[0]) for path in paths)
-
-    def read(self, path: Path) -> FloatArray:
-        """Read grey values (height, width) of an image, ignoring its orientation tag.
-
-        Raises InputError if the file is not an image.
-        """
-        try:
-            content = np.frombuffer(path.read_bytes(), dtype=np.uint8)
-        except OSError as error:
-            raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
-        image = self.cv.imdecode(content, self.cv.IMREAD_UNCHANGED) if content.size else None
-        if image is None:
-            raise InputError(f"{path}: not an image that OpenCV can read; save it again, as PNG for example")
-        if wrong := unfit(image):
-            raise InputError(f"{path}: {messages.sentence_and_remedy(wrong)}")
-        if image.ndim > 2:
-            flags = self.cv.IMREAD_GRAYSCALE | self.cv.IMREAD_IGNORE_ORIENTATION
-            image = self.cv.imdecode(content, flags)
-        return np.asarray(image, dtype=np.float64)
+        return sum(bool(self.find(np.fliplr(one.grey()))[0]) for one in shown)
 
 
 class TagFinder(Finder):
@@ -672,25 +552,25 @@ class BoardFinder(Finder):
                     aruco.CharucoDetector(printed, aruco.CharucoParameters(), _parameters())
                 )
 
-    def mirrored(self, paths: Sequence[Path]) -> int:
+    def mirrored(self, shown: Sequence[StoredImage]) -> int:
         """Number of images of files that show the board when they are mirrored, if it has tags."""
-        return super().mirrored(paths) if self._detectors else 0
+        return super().mirrored(shown) if self._detectors else 0
 
-    def absent(self, paths: Sequence[Path]) -> Finding:
+    def absent(self, shown: Sequence[StoredImage]) -> Finding:
         """Return that the board is in no image, and which other tags of its dictionary are."""
         seen = set[int]()
         if self._detectors:
             finder = self.cv.aruco.ArucoDetector(self._detectors[0].getBoard().getDictionary(), _parameters())
-            for path in paths:
-                numbers = finder.detectMarkers(self.read(path).astype(np.uint8))[1]
+            for one in shown:
+                numbers = finder.detectMarkers(one.grey().astype(np.uint8))[1]
                 seen |= set() if numbers is None else {*np.ravel(numbers).tolist()}
         if seen <= {*self._numbers.tolist()}:
-            return Finding("no_board", REFUSES, Subject(name=str(self.board)), len(paths), unit="1")
+            return Finding("no_board", REFUSES, Subject(name=str(self.board)), len(shown), unit="1")
         low, high = self._numbers[[0, -1]].tolist()
         tags = Finding("tags", amount=min(seen), limit=max(seen), unit="1")
         board = Finding("board", subject=Subject(name=str(self.board._replace(first=min(seen)))))
         own = Subject(name=str(self.board), markers=(low, high))
-        return Finding("other_board", REFUSES, own, len(paths), unit="1", others=(tags, board))
+        return Finding("other_board", REFUSES, own, len(shown), unit="1", others=(tags, board))
 
     def find(self, image: FloatArray) -> tuple[dict[int, Corners], tuple[int, ...]]:
         """Corners (N, …) of the board in an image as tag 0, NaN where unseen; none without it.
@@ -969,107 +849,3 @@ def dictionaries() -> dict[str, str]:
     """Names of all dictionaries of tags, and as OpenCV names them."""
     names = [name for name in dir(opencv().aruco) if name.startswith("DICT_")]
     return {name.upper().removeprefix("DICT_"): name for name in names}
-
-
-def opencv() -> Any:
-    """Return the module of OpenCV; an InputError names the package to install."""
-    try:
-        import cv2
-    except ImportError as error:
-        raise InputError("tags and cameras need OpenCV: pip install '.[detect]'") from error
-    if not hasattr(getattr(cv2, "aruco", None), "ArucoDetector"):
-        raise InputError(f"tags need OpenCV 4.7 or newer, not {cv2.__version__}: pip install '.[detect]'")
-    return cv2
-
-
-@dataclass
-class _Findings:
-    """Detected tags of all images."""
-
-    # pixels and their deviation (4 or 1, 3) of each tag, by pose, view and number of the tag
-    images: dict[tuple[int, int, int], FloatArray] = field(default_factory=dict)
-    ambiguous: int = 0  # number of tags rejected because they occur more than once in an image
-    unrefined: int = 0  # number of corners (or centres) of tags with an edge that is not clean
-    empty: int = 0  # number of images without a tag
-
-    @property
-    def tags(self) -> list[int]:
-        """Numbers of all tags, sorted."""
-        return sorted({tag for _, _, tag in self.images})
-
-
-def observe_tags(
-    pairs: Sequence[tuple[int, *tuple[Path, ...]]],
-    cameras: Sequence[str],
-    q: FloatArray,
-    finder: Finder,
-    points: str,
-    progress: Callable[[str, int, int], None],
-) -> tuple[Observation, _Findings]:
-    """Find tags in images.
-
-    pairs : number and images of each pose, one of each camera; cameras : their names.
-    q : (K, n) joint readings of the poses.
-    finder : of the tags, or of the board, which is tag 0.
-    points : ``corners``: corner k of tag t is marker 4 t + k; ``centers``: tag t is marker t.
-    progress : called after each pose.
-    Raises InputError if an image cannot be read, or has another size than earlier ones of the same camera;
-    WorkFailed if there is no tag in any image, or none that two views saw at a pose.
-    """
-    findings = _Findings()
-    shapes: dict[int, tuple[int, ...]] = {}
-    for k, (_, *views) in enumerate(pairs):
-        for view, path in enumerate(views):
-            image = finder.read(path)
-            if shapes.setdefault(view, image.shape) != image.shape:
-                height, width = shapes[view]
-                raise InputError(
-                    f"{path}: {image.shape[1]}×{image.shape[0]} pixels, the images before it "
-                    f"{width}×{height}; one camera takes images of one size"
-                )
-            tags, ambiguous = finder.find(image)
-            findings.ambiguous += len(ambiguous)
-            findings.empty += not tags
-            for number, tag in tags.items():
-                in_corners = points == "corners"
-                findings.unrefined += int((~tag.clean).sum()) if in_corners else int(not tag.clean.all())
-                findings.images[k, view, number] = np.column_stack(tag[:2]) if in_corners else _center(tag)
-        progress("detect", k + 1, len(pairs))
-    for view in sorted({*range(len(cameras))} - {view for _, view, _ in findings.images}):
-        if count := finder.mirrored([views[view] for _, *views in pairs]):
-            where = Subject(views=(cameras[view],))
-            raise messages.failed(
-                [Finding("mirrored_files", REFUSES, where, count, limit=len(pairs), unit="1")]
-            )
-    if not findings.images and findings.ambiguous:
-        raise messages.failed([Finding("all_repeated", REFUSES, amount=findings.ambiguous, unit="1")])
-    if not findings.images:
-        raise messages.failed([finder.absent([path for _, *views in pairs for path in views])])
-    numbers, each = findings.tags, finder.corners if points == "corners" else 1
-    values = np.full((len(pairs), len(cameras), len(numbers), each, 3), np.nan)
-    for (k, view, number), pixels in findings.images.items():
-        values[k, view, numbers.index(number)] = pixels
-    marker = (each * np.array(numbers, dtype=np.int64)[:, None] + np.arange(each)).ravel()
-    pose = np.array([number for number, *_ in pairs], dtype=np.int64)
-    values = values.reshape(len(pairs), len(cameras), len(marker), 3)
-    images, sigma = values[..., :2], values[..., 2]
-    observation = Observation(pose, marker, q, images, sigma=sigma, view=tuple(cameras))
-    if not np.isfinite(images).any():
-        raise messages.failed([Finding("rejected_markers", REFUSES, amount=images[..., 0].size, unit="1")])
-    if len(cameras) > 1 and (np.isfinite(images[..., 0]).sum(axis=1) < 2).all():
-        raise messages.failed([Finding("unpaired_images", REFUSES)], Setup(view=cameras))
-    return observation, findings
-
-
-def _center(tag: Corners) -> FloatArray:
-    """Crossing of the diagonals of a tag, the image of its centre, and its deviation: (1, 3) px."""
-
-    def crossing(pixels: FloatArray) -> FloatArray:
-        """Crossing (…, 2) of the diagonals of quadrilaterals (…, 4, 2)."""
-        a, b, c, d = np.moveaxis(np.concatenate([pixels, np.ones_like(pixels[..., :1])], axis=-1), -2, 0)
-        p = np.cross(np.cross(a, c), np.cross(b, d))
-        return np.asarray(p[..., :2] / p[..., 2:])
-
-    moved = tag.pixels + np.eye(8).reshape(8, 4, 2) * tag.sigma[:, None]
-    change = crossing(moved) - crossing(tag.pixels)
-    return np.append(crossing(tag.pixels), np.sqrt(0.5 * (change**2).sum()))[None]
