@@ -47,7 +47,7 @@ def test_sentences_are_short(page):
 
 # What a maintainer searches for, and the file below the package that defines it.
 TERMS = {
-    "April ?tag": "detection",
+    "April ?tag": "detection/finders",
     "backlash": "simulation/robot_with_faults",
     "bundle adjustment": "calibration/bundle_adjustment",
     "checks?um|HDF5": "store/run_file",
