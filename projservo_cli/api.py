@@ -30,7 +30,7 @@ from projservo_cli.laws import CODES, REGULATE, law_and_mode, run_name, run_name
 from projservo_cli.loop.jit_notice import compilation
 from projservo_cli.messages import sentence
 from projservo_cli.observations import Observations, require_observations
-from projservo_cli.records import Calibration, FloatArray, InputError, JointList, Plan
+from projservo_cli.records import Calibration, FloatArray, InputError, JointList, Plan, StatedBoard
 from projservo_cli.result_hashes import File
 from projservo_cli.results import ImageModel, MotionPlan, RunTrace
 from projservo_cli.settings.calibration_and_refits import CalibrationSettings
@@ -194,6 +194,7 @@ def calibrate(
     joint_noise_deg: float | None = None,
     max_predicted_px: float | None = None,
     joint_model: str | Sequence[str] | None = None,
+    boards: Sequence[Sequence[float]] = (),
     noise_px: float | None = None,
     seed: int | None = None,
     progress: Progress | bool = True,
@@ -216,6 +217,8 @@ def calibrate(
         calibration is not usable; by default 1 % of the image size.
     joint_model : curves of the joints to fit: ``auto`` for those that the images show, or kinds such as
         ``scale``, of all or of one: ``scale:2``; a list, or a text with commas.
+    boards : boards of known shape whose corners are markers, numbered row by row, each with the number of the
+        marker at its first corner, columns, rows, and perhaps the distance of neighbouring corners, m.
     noise_px : standard deviation of a coordinate, px; by default as the observations state, otherwise
         estimated.
     seed : of the random starts; by default the seed of the observations.
@@ -263,6 +266,7 @@ def calibrate(
         settings.cross_validate,
         settings.max_predicted_px,
         settings.joint_model,
+        tuple(StatedBoard.of(one) for one in boards),
     )
     with Listener(progress) as listener:
         screened, calibration, held_out = calibrating.estimate(seen, asked, progress=listener.progress)

@@ -6,7 +6,7 @@ knows how it is stored.
 """
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import MISSING, Field, dataclass, field, fields, replace
 from functools import cache
 from typing import Any, NamedTuple, TypeVar, get_args, get_origin
@@ -266,6 +266,43 @@ def board_numberings(rows: int, columns: int) -> IntArray:
     return np.stack([np.rot90(index, k).ravel() for k in range(0, 4, 1 if rows == columns else 2)])
 
 
+LEAST_CORNERS = 2
+"""Minimum number of corners in a row or a column of a board."""
+
+
+class StatedBoard(NamedTuple):
+    """A board whose corners are markers, row by row, and whose shape is known."""
+
+    first: int  # number of the marker at its first corner
+    columns: int  # of corners
+    rows: int
+    pitch_m: float | None = None  # distance of neighbouring corners, m; None if unknown
+
+    @classmethod
+    def of(cls, values: Sequence[float]) -> "StatedBoard":
+        """Return the board of three or four numbers. Raises InputError if they are none."""
+        first, columns, rows, pitch = [*values, math.nan][:4] if len(values) in (3, 4) else (-1, 0, 0, 0)
+        whole = [round(number) for number in (first, columns, rows) if math.isfinite(number)]
+        if whole != [first, columns, rows] or first < 0 or min(whole[1:]) < LEAST_CORNERS or pitch <= 0.0:
+            raise InputError(
+                f"boards: {values!r:.60}: give the number of the first marker, columns and rows of corners "
+                f"({LEAST_CORNERS} or more), and perhaps the distance of neighbouring corners, m"
+            )
+        return cls(whole[0], whole[1], whole[2], None if math.isnan(pitch) else float(pitch))
+
+    @property
+    def longest(self) -> tuple[int, int]:
+        """Numbers of the markers at its first and its last corner, farthest apart."""
+        return self.first, self.first + self.columns * self.rows - 1
+
+    def places_of(self, markers: IntArray) -> FloatArray:
+        """Places (m, 2) of markers by their numbers, in pitches along rows and columns; NaN beside it."""
+        at = np.asarray(markers) - self.first
+        places = np.stack([at % self.columns, at // self.columns], axis=1).astype(np.float64)
+        places[(at < 0) | (at >= self.columns * self.rows)] = np.nan
+        return places
+
+
 def no_lenses(views: int) -> FloatArray:
     """Lenses (V, 5) that do not distort."""
     return np.tile([0.0, 0.0, 1.0, 0.0, 0.0], (views, 1))
@@ -503,6 +540,11 @@ class CalibratedBody(RecordPart):
 
     marker: IntArray = _array("marker", about="number of the marker")
     M: FloatArray = _array("marker coordinate", about="markers at the reference, a_inf @ M = 1")
+    boards: FloatArray | None = _optional_array(
+        "board number",
+        about="boards whose shape the fit uses: number of the first marker, columns, rows, and pitch in m, "
+        "NaN if unknown",
+    )
 
     def indices_of(self, numbers: Iterable[int]) -> list[int]:
         """Return indices of markers in ``marker`` and ``M`` by their numbers; ValueError if unknown."""

@@ -63,6 +63,28 @@ def _generators(params: Parameters) -> list[FloatArray]:
     return [B[i, : 2 if slides else 4] for i, slides in enumerate(prismatic)]
 
 
+# Number of parameters of a board of known shape: its place, its turn and its size.
+BOARD = 7
+
+
+@lru_cache(maxsize=2)
+def _similarities(params: Parameters, board: tuple[int, ...]) -> FloatArray:
+    """Motions (b, 7, 4, 4) of boards of known shape about their middles: turns, shifts, and a scaling.
+
+    board : (m,) index of the board of each marker, −1 for none.
+    """
+    which, M = np.array(board), params.M[:, :3]
+    boards = np.unique(which[which >= 0])
+    B = np.zeros((len(boards), BOARD, 4, 4))
+    for b, one in zip(B, boards, strict=True):
+        center = M[which == one].mean(axis=0)
+        size = float(np.linalg.norm(M[which == one] - center, axis=1).mean())
+        b[:3, :3, :3], b[6, :3, :3] = cross_matrix(np.eye(3)), np.eye(3)
+        b[:3, :3, 3], b[6, :3, 3] = -(b[:3, :3, :3] @ center), -center
+        b[3:6, :3, 3] = size * np.eye(3)
+    return B
+
+
 def moved_operators(params: Parameters) -> list[FloatArray]:
     """Derivatives B Ĥ − Ĥ B (b, 4, 4) of each operator by the parameters of its joint."""
     return [B @ H_hat - H_hat @ B for B, H_hat in zip(_generators(params), params.H_hat, strict=True)]
@@ -70,7 +92,7 @@ def moved_operators(params: Parameters) -> list[FloatArray]:
 
 @dataclass(frozen=True, eq=False)
 class LeastSquares:
-    """Detections to fit and the order of the parameters: cameras, joints, lenses, curve, then markers.
+    """Detections to fit and the order of the parameters: cameras, joints, lenses, curve, boards, markers.
 
     Residuals and derivatives are weighted, so all have the noise of a pixel of weight one. The derivative of
     the images is compact: (V, N, 2, c) for each detection by the c parameters it depends on, the last three
@@ -84,7 +106,7 @@ class LeastSquares:
     joint: IntArray  # (n + 1,) first parameter of each joint, then of the lenses if they are estimated
     shared: int  # number of parameters before the parameters of the markers
     size: int  # number of parameters
-    columns: IntArray  # (2, c - 3) parameters that all detections of a view depend on
+    columns: IntArray  # (V, c - 3) parameters that all detections of a view depend on
     # (n,) noise of joint readings over pixel noise, rad/px or m/px; None where readings are exact
     tau: FloatArray | None = None
     curve_terms: int = 0  # number of terms of the curve of the joints
@@ -96,20 +118,22 @@ class LeastSquares:
     ) -> "LeastSquares":
         """Problem of fitting detections about the reference joints (n,), rad or m.
 
-        12 parameters a camera, 4 a revolute and 2 a prismatic joint, 3 a marker, ``lens_terms`` a lens, and
-        ``curve_terms``. The operators of poses of the flange are known.
+        12 parameters a camera, 4 a revolute and 2 a prismatic joint, 3 a marker, ``lens_terms`` a lens,
+        ``curve_terms``, and 7 a board of known shape, on whose markers their own parameters have no
+        influence. The operators of poses of the flange are known.
         """
         V, known = len(detections.seen), detections.chart is not None
         of_joints = np.where(detections.prismatic, 2, 4) * (not known)
         joint = V * CAMERA + np.concatenate([[0], np.cumsum(of_joints)])
         count = lens_terms
-        shared = int(joint[-1]) + V * count + curve_terms
+        curved = int(joint[-1]) + V * count
+        shared = curved + curve_terms + BOARD * len(detections.boards)
         view = np.arange(V)[:, None]
         parts = (
             view * CAMERA + np.arange(CAMERA),
             np.broadcast_to(np.arange(joint[0], joint[-1]), (V, joint[-1] - joint[0])),
             joint[-1] + view * count + np.arange(count),
-            np.broadcast_to(np.arange(shared - curve_terms, shared), (V, curve_terms)),
+            np.broadcast_to(np.arange(curved, shared), (V, shared - curved)),
         )
         columns = np.concatenate(parts, axis=1)
         q = detections.q - q_reference
@@ -142,7 +166,18 @@ class LeastSquares:
     @property
     def lens_terms(self) -> int:
         """Number of parameters of each lens."""
-        return int(self.shared - self.curve_terms - self.joint[-1]) // len(self.detections.seen)
+        return int(self.curved.start - self.joint[-1]) // len(self.detections.seen)
+
+    @property
+    def curved(self) -> slice:
+        """Parameters of the curve of the joints."""
+        end = self.shared - BOARD * len(self.detections.boards)
+        return slice(end - self.curve_terms, end)
+
+    @property
+    def free(self) -> int:
+        """Number of parameters that move images, those of the frame included."""
+        return self.size - 3 * int(np.count_nonzero(self.detections.on_board))
 
     @property
     def by_pose(self) -> bool:
@@ -189,7 +224,12 @@ class LeastSquares:
             blocks.append(by_lens[..., : self.lens_terms])
         if self.curve_terms:
             blocks.append(params.by_curve(images, q[detections.pose_of]))
-        blocks.append(D[-1][..., :3])
+        B = _similarities(params, detections.board_key)
+        for b, board in zip(B, detections.boards, strict=True):
+            velocity = (params.M @ b.transpose(2, 1, 0).reshape(4, -1)).reshape(-1, 4, BOARD)
+            velocity[detections.board != board] = 0.0
+            blocks.append(D[-1] @ velocity[detections.marker_of])
+        blocks.append(D[-1][..., :3] * ~detections.on_board[detections.marker_of, None, None])
         return np.concatenate(blocks, axis=3) * detections.weight[..., None, None]
 
     def joint_derivative(self, params: Parameters) -> FloatArray:
@@ -205,15 +245,20 @@ class LeastSquares:
         x, further = x[: self.size], x[self.size :]
         H_hat = params.H_hat if params.known_arm else self._moved_screws(params, x)
         M = params.M.copy()
-        M[:, :3] += x[self.shared :].reshape(-1, 3)
+        own = ~self.detections.on_board
+        M[own, :3] += x[self.shared :].reshape(-1, 3)[own]
+        B = _similarities(params, self.detections.board_key)
+        motions = expm((x[self.curved.stop : self.shared].reshape(-1, BOARD, 1, 1) * B).sum(axis=1))
+        for motion, board in zip(motions, self.detections.boards, strict=True):
+            M[self.detections.board == board] @= motion.T
         lens = params.lens
         if lens is not None:
             lens = lens.copy()
             terms = list(TERMS[: self.lens_terms])
-            lens[:, terms] += x[self.joint[-1] : self.shared - self.curve_terms].reshape(len(lens), -1)
+            lens[:, terms] += x[self.joint[-1] : self.curved.start].reshape(len(lens), -1)
         curve = params.curve
         if curve is not None:
-            step = np.pad(x[self.shared - self.curve_terms : self.shared, None], ((0, 0), (3, 0)))
+            step = np.pad(x[self.curved, None], ((0, 0), (3, 0)))
             curve = curve._replace(terms=curve.terms + step)
         offsets = params.offsets
         if self.tau is not None and further.size:
@@ -269,8 +314,21 @@ class LeastSquares:
             wanted = (motions @ H_hat - H_hat @ motions).reshape(-1, 16).T
             coefficients = np.linalg.lstsq(reach.reshape(-1, 16).T, wanted, rcond=None)[0]
             result[self.joint[i] : self.joint[i + 1]] = coefficients
-        moved = (params.M @ motions.swapaxes(1, 2))[..., :3]
+        for b, B in enumerate(_similarities(params, self.detections.board_key)):
+            at = slice(self.curved.stop + BOARD * b, self.curved.stop + BOARD * (b + 1))
+            result[at] = np.linalg.lstsq(B.reshape(BOARD, 16).T, motions.reshape(g, 16).T, rcond=None)[0]
+        moved = (params.M @ motions.swapaxes(1, 2))[..., :3] * ~self.detections.on_board[:, None]
         result[self.shared :] = moved.reshape(g, -1).T
+        return result
+
+    def markers_by_boards(self, params: Parameters) -> FloatArray:
+        """Derivatives (m, 3, 7 b) of markers by the parameters of their boards of known shape."""
+        B = _similarities(params, self.detections.board_key)
+        result = np.zeros((len(params.M), 3, BOARD * len(B)))
+        for b, (motion, board) in enumerate(zip(B, self.detections.boards, strict=True)):
+            on = self.detections.board == board
+            moved = (motion @ params.M[on].T)[:, :3].transpose(2, 1, 0)
+            result[on, :, BOARD * b : BOARD * (b + 1)] = moved
         return result
 
     def at_poses(self, values: FloatArray) -> FloatArray:

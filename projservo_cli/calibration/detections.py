@@ -92,6 +92,8 @@ class Detections:
     mount: str = WORLD  # with cameras on the tool, the chain ends at the scene: joints in reverse, negated
     pair: tuple[int, ...] = (0, 1)  # the one or two views by which a fit begins and noise is known
     chart: FlangeChart | None = None  # of poses of the flange; None for joints
+    # (m,) index of the board of known shape that holds a marker, −1 for none; None without such boards
+    board: IntArray | None = None
 
     @classmethod
     def of(cls, observation: Observation, joint_types: str, mount: str = WORLD) -> "Detections":
@@ -250,7 +252,23 @@ class Detections:
         """Select markers (m,) and their observations."""
         left = self.rows(keep[self.marker_of])
         numbers = (np.cumsum(keep) - 1)[left.marker_of]
-        return dataclasses.replace(left, marker=self.marker[keep], marker_of=numbers)
+        board = None if self.board is None else self.board[keep]
+        return dataclasses.replace(left, marker=self.marker[keep], marker_of=numbers, board=board)
+
+    @property
+    def on_board(self) -> BoolArray:
+        """Mask (m,) of markers on boards of known shape."""
+        return np.zeros(self.marker.size, dtype=np.bool_) if self.board is None else self.board >= 0
+
+    @property
+    def boards(self) -> IntArray:
+        """Indices (b,) of the boards of known shape that hold some marker."""
+        return np.empty(0, dtype=np.int64) if self.board is None else np.unique(self.board[self.on_board])
+
+    @property
+    def board_key(self) -> tuple[int, ...]:
+        """``board`` as a key of what depends on it."""
+        return () if self.board is None else tuple(self.board.tolist())
 
     def covering(self, order: IntArray, wanted: int) -> BoolArray:
         """Mask (m,) of markers, taken in an order until each pose has as many as wanted, seen by the pair."""

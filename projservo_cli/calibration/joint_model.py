@@ -160,7 +160,7 @@ def _keys(curve: JointCurve) -> list[_Term]:
 
 def _deviations(found: Solution) -> FloatArray:
     """Standard deviations (T,) of the coefficients of a curve."""
-    rows = slice(found.problem.shared - found.problem.curve_terms, found.problem.shared)
+    rows = found.problem.curved
     return np.asarray(found.sigma_px * np.linalg.norm(found.errors().shared[rows], axis=1))
 
 

@@ -51,6 +51,7 @@ from projservo_cli.calibration.initial.camera_weights import with_own_noise
 from projservo_cli.calibration.initial.epipolar import ImageFrame, ImageGeometry
 from projservo_cli.calibration.initial.initialization import Nominal, Progress, Search
 from projservo_cli.calibration.joint_model import AUTO, Hypothesis, fit_joint_model, hypotheses_of
+from projservo_cli.calibration.known_shape import with_known_shapes
 from projservo_cli.calibration.lens_estimation import fit_lens, share_explained, undistorted
 from projservo_cli.calibration.prediction import LENS, along_the_arm
 from projservo_cli.calibration.projective import Projective
@@ -89,6 +90,7 @@ from projservo_cli.records import (
     Observation,
     ParameterErrors,
     Rejections,
+    StatedBoard,
     StatedErrors,
     changed,
     letters_of,
@@ -132,6 +134,7 @@ def calibrate(
     max_predicted_px: float | None = None,
     mount: str = WORLD,
     joint_model: str | Sequence[str] | None = None,
+    boards: Sequence[StatedBoard] = (),
     fitted: Callable[[Solution, float], None] | None = None,
     progress: Progress = lambda what, done, total: None,
 ) -> Calibration:
@@ -158,6 +161,7 @@ def calibrate(
     joint_model : curves of the joints that ``bundle_adjustment`` fits: ``auto`` for those that the images
         show, or some of ``CURVES``, of all joints or of one, as ``scale:2``; None where joints are as they
         read.
+    boards : boards whose corners are markers; their shape is used unless the images contradict it.
     fitted : called with the solution of ``bundle_adjustment`` and its noise, px.
     progress : called with the current task of ``bundle_adjustment``, how much of it is done, and its total.
 
@@ -213,7 +217,7 @@ def calibrate(
         problem = LeastSquares.of(detections, detections.reference())
         search = Search(problem, epipolar, of_pair, rng, progress, joint_noise)
         limit = MAX_PREDICTED * float(frame.size.max()) if max_predicted_px is None else max_predicted_px
-        asked = lens, init, curves
+        asked = lens, init, curves, boards
         solution, expected, result = _maximum_likelihood(search, whole, frame, expect, asked, limit)
         if of_still:
             still_too = np.column_stack([numbers, np.full(len(numbers), WHY_LOST.index("still"))])
@@ -255,17 +259,17 @@ def _maximum_likelihood(
     whole: Detections,
     frame: ImageFrame,
     expect: Callable[[ImageGeometry], Expected],
-    asked: tuple[bool, Nominal | None, list[Hypothesis] | None],
+    asked: tuple[bool, Nominal | None, list[Hypothesis] | None, Sequence[StatedBoard]],
     limit_px: float,
 ) -> tuple[Solution, Expected, Calibration]:
     """Maximum-likelihood solution, its expected noise and its record.
 
     start : search by the pair of views; whole, frame : detections and images of all views; asked : whether to
-        estimate lenses, a start, and curves of the joints, None for those that the data show.
+        estimate lenses, a start, curves of the joints, None for those that the data show, and boards.
     Raises Misfit, naming the joint at fault if one explains it.
     """
-    search, epipolar, (lens, init, curves), curved = start, start.epipolar, asked, None
-    expected = expect(epipolar)
+    search, epipolar, (lens, init, curves, boards), curved = start, start.epipolar, asked, None
+    expected, of_boards = expect(epipolar), list[Finding]()
     try:
         solution, note = solve(start if len(whole.view) <= 2 or init else fewer(start), expected, init)
         if len(whole.view) > 2:
@@ -286,7 +290,14 @@ def _maximum_likelihood(
             curved = fit_joint_model(solution, curves, epipolar)
             solution = solution if curved is None else curved.solution
         solution = fit_joint_noise(solution, expected, search.joint_noise)
+        if boards:
+            search.progress("calibration, boards", 0, 1)
+            solution, boards, of_boards = with_known_shapes(solution, boards, expected)
         result = _refined(solution, epipolar, expected, frame, limit_px)
+        if boards:
+            result = changed(
+                result, boards=np.array([[np.nan if v is None else v for v in one] for one in boards])
+            )
     except Misfit as refused:
         # The joints of a simulation are as configured, so none is at fault.
         last = (
@@ -314,7 +325,7 @@ def _maximum_likelihood(
             ahead.append(dataclasses.replace(doubted.finding, severity=severity))
     if epipolar.sigma_px < expected.min_px:
         ahead.append(Finding("exact_images", LIMITS, amount=epipolar.sigma_px, unit="px"))
-    result = with_findings(result, filter(None, [_worst_view(result), note]), ahead)
+    result = with_findings(result, filter(None, [_worst_view(result), note, *of_boards]), ahead)
     if curved is not None and result.joint_curve is not None:
         result = changed(result, joint_curve=np.hstack([result.joint_curve[:, :5], curved.gains]))
     return solution, expected, result

@@ -61,10 +61,12 @@ class Projective:
         back = np.linalg.inv(self.W)
         cameras = [scale * np.kron(np.eye(3), back.T) for scale in self.camera_scale]
         joints = [(self.W @ moved @ back).reshape(-1, 16).T for moved in moved_operators(solution.params)]
-        lenses = np.eye(solution.problem.shared - solution.problem.joint[-1])
-        by_marker = self.W[:, :3]
-        shared = block_diag(*cameras, *joints, lenses) @ errors.shared
-        return Errors(shared, by_marker @ errors.marker, by_marker @ errors.own)
+        problem, by_marker = solution.problem, self.W[:, :3]
+        own, of_boards = np.split(errors.shared, [problem.curved.stop])
+        lenses = np.eye(len(own) - problem.joint[-1])
+        shared = block_diag(*cameras, *joints, lenses) @ own
+        marker = errors.marker + problem.markers_by_boards(solution.params) @ of_boards
+        return Errors(shared, by_marker @ marker, by_marker @ errors.own)
 
     def defects(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Defects (n,) of [RH00] section 2: of Ĥ³ = −Ĥ or Ĥ² = 0, of zero trace, of one plane at infinity."""

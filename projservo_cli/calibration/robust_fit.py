@@ -227,11 +227,11 @@ class Solution:
         """
         problem, params = self.problem, self.params
         s, m, offsets = problem.shared, len(params.M), 0 if problem.tau is None else problem.q.size
-        gauge = problem.gauge(params)
+        gauge, own_place = problem.gauge(params), ~problem.detections.on_board[:, None, None]
         if problem.by_pose:
             J = problem.whitened(params, problem.dense(problem.derivative(params), self.used), self.used)
             factor = inverse_root(J, np.linalg.norm(J, axis=0), gauge)
-            return Errors(factor[:s], factor[s:].reshape(m, 3, -1), np.zeros((m, 3, 3)))
+            return Errors(factor[:s], own_place * factor[s:].reshape(m, 3, -1), np.zeros((m, 3, 3)))
         R = np.eye(s + offsets)[s:]
         squares = R.sum(axis=0)
         follows, own = np.zeros((m, 3, s + offsets)), np.zeros((m, 3, 3))
@@ -248,7 +248,7 @@ class Solution:
         free = np.zeros((s + offsets, gauge.shape[1]))
         free[:s] = gauge[:s]
         factor = inverse_root(R, np.sqrt(squares), free)
-        return Errors(factor[:s], follows @ factor, own)
+        return Errors(factor[:s], (follows @ factor) * own_place, own * own_place)
 
     def _tracks(self, count: int) -> Iterator[tuple[IntArray, FloatArray, FloatArray]]:
         """Yield markers (k,) and derivatives of their images by common parameters and their own.
@@ -571,7 +571,7 @@ def _near(problem: LeastSquares, params: Parameters, limit: float) -> BoolArray:
 
 def _degrees_of_freedom(problem: LeastSquares, params: Parameters, used: BoolArray) -> int:
     """Number of coordinates used minus the rank of their derivative."""
-    return 2 * int(np.count_nonzero(used)) - problem.size + len(problem.gauge(params).T)
+    return 2 * int(np.count_nonzero(used)) - problem.free + len(problem.gauge(params).T)
 
 
 def fit_joint_noise(exact: Solution, expected: Expected, given: float | None) -> Solution:

@@ -187,6 +187,13 @@ def overrides(options: Mapping[str, Any]) -> list["Override"]:
         values: Any = [one for _, one in sizes]
         values = dict(zip(names, values, strict=True)) if names else values if len(values) > 1 else values[0]
         found.append(Override(flag, "data.image_size_px", values))
+    if (text := options.get("board")) is not None:
+        from projservo_cli.detection.finders import Board
+
+        board = Board.of(text)
+        rows, columns = board.shape
+        shape = {"columns": columns, "rows": rows, "pitch_mm": board.pitch_mm}
+        found.append(Override(f"--board {text}", "markers.boards", [shape]))
     found += map(Override.parse, options["sets"])  # undoes earlier overrides of its key
     if goals := options.get("goals"):
         found += to_goals(f"--goal {' --goal '.join(goals)}", goals)

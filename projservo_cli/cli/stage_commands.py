@@ -48,6 +48,12 @@ _OF_STAGES = (
         type=click.Choice(["world", "tool"]),
         help="Where the table's cameras are: fixed in the world, or on the tool. Default: world.",
     ),
+    click.option(
+        "--board",
+        metavar="KIND:CxR[:MMmm]",
+        help="The table's markers are corners of a board: chessboard:9x7:25mm (inner corners) or "
+        "charuco:11x8 (squares), from marker 0. A fit uses its shape.",
+    ),
     click.option("--joints", metavar="RRPRRR", help="Type of each joint of the table. Default: all R."),
     option.joint_unit(help="Unit of the table's revolute joints. Default: rad."),
     click.option(

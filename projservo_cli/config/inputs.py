@@ -92,6 +92,7 @@ def calibration_inputs(config: Config, files: Files | None = None) -> Calibratio
         settings.cross_validate,
         settings.max_predicted_px,
         settings.joint_model,
+        config.markers.stated_boards if config.markers is not None else (),
     )
     inputs: CalibrationInputs | RefitInputs = CalibrationInputs(source, how, settings.joint_noise)
     for i, one in enumerate(settings.refits):

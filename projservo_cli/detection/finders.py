@@ -488,23 +488,28 @@ class Board(NamedTuple):
     rows: int  # inner corners of a chessboard, squares of a ChArUco board
     columns: int
     first: int = 0  # number of the first tag on a ChArUco board
+    pitch_mm: float | None = None  # distance of neighbouring corners, mm, if it is stated
 
     @classmethod
     def of(cls, text: str) -> "Board":
         """Read such as ``chessboard:9x7``, 9 columns and 7 rows. Raises InputError for other texts."""
-        parts = re.fullmatch(rf"({'|'.join(_BOARDS)}):(\d{{1,3}})x(\d{{1,3}})(?::first=(\d{{1,4}}))?", text)
+        form = rf"({'|'.join(_BOARDS)}):(\d{{1,3}})x(\d{{1,3}})(?::([\d.]{{1,9}})mm)?(?::first=(\d{{1,4}}))?"
+        parts = re.fullmatch(form, text)
         if parts is None or min(int(parts[2]), int(parts[3])) < LEAST_ROWS:
             raise InputError(
                 f"--board {text}: write kind:columnsxrows, of {LEAST_ROWS} or more, such as chessboard:9x7 "
-                "(inner corners), charuco:11x8 (squares), or charuco:11x8:first=20 if its first tag is 20"
+                "(inner corners), charuco:11x8 (squares), charuco:11x8:25mm with the side of a square, or "
+                "charuco:11x8:first=20 if its first tag is 20"
             )
-        if parts[4] and parts[1] != "charuco":
-            raise InputError(f"--board {text}: a {parts[1]} has no tags: leave out first={parts[4]}")
-        return cls(parts[1], int(parts[3]), int(parts[2]), int(parts[4] or 0))
+        if parts[5] and parts[1] != "charuco":
+            raise InputError(f"--board {text}: a {parts[1]} has no tags: leave out first={parts[5]}")
+        return cls(parts[1], int(parts[3]), int(parts[2]), int(parts[5] or 0), _millimetres(text, parts[4]))
 
     def __str__(self) -> str:
-        """Kind, columns, rows, and the first tag unless it is 0."""
-        return f"{self.kind}:{self.columns}x{self.rows}" + (f":first={self.first}" if self.first else "")
+        """Kind, columns, rows, the side of a square if it is stated, and the first tag unless it is 0."""
+        pitch = "" if self.pitch_mm is None else f":{self.pitch_mm:g}mm"
+        first = f":first={self.first}" if self.first else ""
+        return f"{self.kind}:{self.columns}x{self.rows}{pitch}{first}"
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -521,6 +526,19 @@ class Board(NamedTuple):
     def grid_points(self) -> FloatArray:
         """Places (N, 2) of the corners on the board, in squares."""
         return np.indices(self.shape)[::-1].reshape(2, -1).T.astype(np.float64)
+
+
+def _millimetres(text: str, number: str | None) -> float | None:
+    """Side of a square, mm, None without one. Raises InputError if it is none."""
+    if number is None:
+        return None
+    try:
+        side = float(number)
+    except ValueError:
+        side = 0.0
+    if not side > 0.0:
+        raise InputError(f"--board {text}: {number}mm is no side of a square: write such as 25mm")
+    return side
 
 
 class BoardFinder(Finder):

@@ -90,6 +90,15 @@ CALIBRATION = {
     "unmodelled_lens": Row(
         "lens distortion would explain {percent} % of the squared residuals", "try --lens", limit="lens"
     ),
+    "other_pitch": Row(
+        "squares of the board {name} are {pitches}",
+        "measure the board, and look at the unit and the scale of the readings",
+    ),
+    "unused_shape": Row(
+        "the board {name} is not as stated: its corners lie {amount} squares off, and squares are {stretch} "
+        "along its rows than across; its shape is not used",
+        "print it again, mount it flat, or mend its first marker, columns and rows",
+    ),
     "no_lens": Row("the images show no lens distortion", "omit --lens", limit="lens"),
     "lens_off_center": Row(
         "the lens distortion is centred on the region where markers were seen",

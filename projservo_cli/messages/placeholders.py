@@ -159,6 +159,22 @@ def _size(one: Finding) -> str:
     return f"{factor * abs(one.amount):.2g}{unit}{spread}"
 
 
+def _stretch(one: Finding) -> str:
+    """Say how much longer, or shorter, the squares of a board are along its rows than across."""
+    longer = one.others[0].amount
+    return f"{100.0 * abs(longer):.2g} % {'longer' if longer > 0.0 else 'shorter'}"
+
+
+def _pitches(one: Finding) -> str:
+    """Compare squares of a board by readings in metres with those stated."""
+    share = 100.0 * (one.amount / one.limit - 1.0)
+    readings, board = ("long", "printed large") if share > 0.0 else ("short", "printed small")
+    stated = quantity(one.limit, one.unit, 5)
+    ends = f"readings are {abs(share):.2g} % {readings}, or the board is {board}"
+    found = f"{1e3 * one.amount:.3f} ± {1e3 * one.deviation:.3f} mm"
+    return f"{found} by the readings, and {stated} as stated: {ends}"
+
+
 def numbered(kind: str, numbers: Sequence[int]) -> str:
     """Name things of a kind by their numbers."""
     return f"{kind}{'s' * (len(numbers) > 1)} {joined(numbers)}"
@@ -336,6 +352,8 @@ VALUES: dict[str, Callable[[Wording], object]] = {
     # Of amounts.
     "more": lambda told: "less" if told.one.amount < 0.0 else "more" if told.single else "more or less",
     "size": lambda told: _size(told.one),
+    "pitches": lambda told: _pitches(told.one),
+    "stretch": lambda told: _stretch(told.one),
     "amount": lambda told: joined([quantity(each.amount, each.unit) for each in told.alike]),
     "limit": lambda told: joined([quantity(each.limit, each.unit) for each in told.alike]),
     "number": lambda told: f"{told.one.limit:.3g}",

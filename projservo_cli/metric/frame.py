@@ -6,8 +6,10 @@ into a rigid twist, up to one scale, which a known length fixes. Source of the p
 
 Base frame, at readings of zero: z along joint 1, x along z × the direction of the first joint that is not
 parallel to it. The origin is on the first revolute axis, at its common normal with the first revolute axis
-that is not parallel to it. Tool frame: origin at the mean of the face, x from its first to its second marker,
-z across the plane of the first two and the next that is not on their line.
+that is not parallel to it. If all are parallel, which takes a board of known shape, it is there at the foot
+of the middle of the face, and x leads to the next axis where no direction is across. Tool frame: origin at
+the mean of the face, x from its first to its second marker, z across the plane of the first two and the next
+that is not on their line.
 
 Cameras on the tool are in the flange frame: the base frame of the arm as seen from its last joint back, so z
 along the last joint. Their pose there is the hand–eye transformation. The markers are points of the base.
@@ -35,6 +37,13 @@ from projservo_cli.geometry.displacements import (
     twists,
 )
 from projservo_cli.geometry.flange import FlangeChart
+from projservo_cli.geometry.invariant_forms import (
+    board_steps,
+    changes_by_rotations,
+    differences_of_lengths,
+    distortions_of_boards,
+    form_of,
+)
 from projservo_cli.geometry.joint_curve import true_joints
 from projservo_cli.geometry.lens import TERMS, undistort
 from projservo_cli.geometry.stereo import triangulate_points
@@ -46,7 +55,9 @@ from projservo_cli.records import (
     Calibration,
     FloatArray,
     InputError,
+    IntArray,
     JointCurve,
+    StatedBoard,
     WorkFailed,
     prismatic_of,
 )
@@ -65,7 +76,11 @@ _UNEQUAL_SIDES = 0.15
 _SECOND_FORM = 1e-6
 _ALL_PARALLEL = (
     "metric: within their noise all revolute axes are parallel, which leaves the stretch along them open: a "
-    "revolute joint about another direction would fix it"
+    "revolute joint about another direction, or a board of known shape (--board), would fix it"
+)
+_OPEN_WITH_BOARDS = (
+    "metric: joints and boards leave stretches or shears open: tilt a board against the axes of the joints, "
+    "or add a revolute joint about another direction"
 )
 _MIRRORED = "metric: one camera's images are mirrored: turn its flip off, and record again"
 
@@ -116,6 +131,59 @@ class MetricParameters(NamedTuple):
         return pixels_of(self.P, self.lens, homogeneous(points)).swapaxes(-3, -2)
 
 
+class BoardCorners(NamedTuple):
+    """Corners of a board of known shape among the markers."""
+
+    at: IntArray  # (k,) indices of the markers
+    places: FloatArray  # (k, 2) in pitches
+
+    @classmethod
+    def in_calibration(cls, c: Calibration) -> tuple["BoardCorners", ...]:
+        """Those of each board whose shape a calibration uses."""
+        found = []
+        for board in () if c.boards is None else map(StatedBoard.of, c.boards.tolist()):
+            places = board.places_of(c.marker)
+            at = np.flatnonzero(np.isfinite(places[:, 0]))
+            found.append(cls(at, places[at]))
+        return tuple(found)
+
+
+def upgrade_of(c: Calibration, H_hat: FloatArray, M: FloatArray) -> FloatArray:
+    """Homographies (…, 4, 4) to a metric frame, of operators (…, n, 4, 4) and markers (…, m, 4).
+
+    c : calibration that they are of, or that they are near. By boards of known shape, where there are some,
+        otherwise by the joints alone.
+    Raises InputError if these leave it open.
+    """
+    boards = BoardCorners.in_calibration(c)
+    if not boards:
+        return invariant_upgrade(H_hat, c.prismatic)
+    D, a_inf, L = _actions(H_hat)
+    X = M @ D.swapaxes(-1, -2) / (M @ a_inf[..., None])
+    slides = (D[..., None, :, :] @ H_hat[..., c.prismatic, :, :] @ M[..., None, 0, :, None])[..., 0]
+    steps = np.stack([board_steps(one.places, X[..., one.at, :]) for one in boards], axis=-3)
+    rows = [
+        changes_by_rotations(L[..., ~c.prismatic, :, :].swapaxes(-1, -2)),
+        differences_of_lengths(slides),
+        distortions_of_boards(steps).reshape(*steps.shape[:-3], -1, 6),
+    ]
+    _, sizes, forms = np.linalg.svd(np.concatenate(rows, axis=-2))
+    if (sizes[..., 4] < _SECOND_FORM * sizes[..., 0]).any():
+        raise InputError(_OPEN_WITH_BOARDS)
+    try:
+        C = np.linalg.cholesky(form_of(forms[..., 5, :])).swapaxes(-1, -2)
+    except np.linalg.LinAlgError:
+        raise InputError(_OPEN_WITH_BOARDS) from None
+    return np.concatenate([C @ D, a_inf[..., None, :]], axis=-2)
+
+
+def _actions(H_hat: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Basis D (…, 3, 4) across the plane at infinity (…, 4) of operators, and actions L = D Ĥ Dᵀ."""
+    U = np.linalg.svd(np.concatenate(np.moveaxis(H_hat, -3, 0), axis=-1))[0]
+    D, a_inf = U[..., :3].swapaxes(-1, -2), U[..., 3]
+    return D, a_inf, D[..., None, :, :] @ H_hat @ D.swapaxes(-1, -2)[..., None, :, :]
+
+
 def invariant_upgrade(H_hat: FloatArray, prismatic: BoolArray) -> FloatArray:
     """Homographies (…, 4, 4) from the projective frame to one in which operators (…, n, 4, 4) are twists.
 
@@ -131,10 +199,8 @@ def invariant_upgrade(H_hat: FloatArray, prismatic: BoolArray) -> FloatArray:
             if turning.any()
             else "without a revolute joint five stretches and shears are open: two that are not parallel"
         )
-        raise InputError(f"metric: {left} would fix it")
-    U = np.linalg.svd(np.concatenate(np.moveaxis(H_hat, -3, 0), axis=-1))[0]
-    D, a_inf = U[..., :3].swapaxes(-1, -2), U[..., 3]
-    L = D[..., None, :, :] @ H_hat @ D.swapaxes(-1, -2)[..., None, :, :]
+        raise InputError(f"metric: {left} or a board of known shape (--board) would fix it")
+    D, a_inf, L = _actions(H_hat)
     sizes, S = invariant_form(L[..., turning, :, :])
     if (sizes[..., 4] < _SECOND_FORM * sizes[..., 0]).any():
         raise InputError(_ALL_PARALLEL)
@@ -151,14 +217,8 @@ def invariant_form(L: FloatArray) -> tuple[FloatArray, FloatArray]:
     Also returns the singular values (…, 6) of the changes of all symmetric forms; S is unique if but the last
     is zero.
     """
-    i, j = np.triu_indices(3)
-    basis = np.zeros((6, 3, 3))
-    basis[range(6), i, j] = basis[range(6), j, i] = np.where(i == j, 1.0, np.sqrt(0.5))
-    moved = np.einsum("...nab,sbc->...nacs", L, basis)
-    changes = (moved + np.einsum("...nacs->...ncas", moved)).reshape(*L.shape[:-3], -1, 6)
-    _, sizes, rows = np.linalg.svd(changes)
-    S = np.einsum("...s,sab->...ab", rows[..., 5, :], basis)
-    return sizes, np.asarray(S * np.sign(np.trace(S, axis1=-2, axis2=-1))[..., None, None])
+    _, sizes, rows = np.linalg.svd(changes_by_rotations(L))
+    return sizes, form_of(rows[..., 5, :])
 
 
 def directions(axes: FloatArray, prismatic: BoolArray) -> FloatArray:
@@ -167,28 +227,71 @@ def directions(axes: FloatArray, prismatic: BoolArray) -> FloatArray:
     return np.asarray(d / np.linalg.norm(d, axis=-1, keepdims=True))
 
 
-def base_joints(axes: FloatArray, prismatic: BoolArray) -> tuple[int, int, int]:
-    """Joints that the base frame rests on, by screws (n, 6): for x, then the pair for the origin.
+class BaseJoints(NamedTuple):
+    """Joints, by index, that a base frame rests on."""
 
-    Raises InputError if all revolute axes are parallel.
+    x: int | None  # that x is across, besides joint 1; None if all directions are parallel
+    first: int | None  # first revolute joint; None without one
+    other: int | None  # first revolute joint with another direction; None without one
+    apart: int | None  # first revolute joint with another axis of the same direction; None without one
+
+
+def base_joints(axes: FloatArray, prismatic: BoolArray) -> BaseJoints:
+    """Joints that the base frame rests on, by screws (n, 6).
+
+    Raises InputError if no joint fixes the direction of x.
     """
     d = directions(axes, prismatic)
     sine = np.linalg.norm(np.cross(d[:, None], d[None]), axis=-1)
     turning = np.flatnonzero(~prismatic)
-    off = turning[sine[turning[0], turning] > _PARALLEL]
-    if not off.size:
+    if not turning.size:
+        first, off, beside = None, turning, turning
+    else:
+        first = int(turning[0])
+        off = turning[sine[first, turning] > _PARALLEL]
+        w, v = axes[turning, :3], axes[turning, 3:]
+        from_first = np.cross(w, v) - np.cross(w[0], v[0])
+        apart = np.linalg.norm(np.cross(from_first, w[0]), axis=-1)
+        beside = turning[apart > _PARALLEL * max(float(apart.max()), 1e-12)]
+    across = np.flatnonzero(sine[0] > _PARALLEL)
+    if not across.size and not beside.size:
         raise InputError(_ALL_PARALLEL)
-    return int(np.argmax(sine[0] > _PARALLEL)), int(turning[0]), int(off[0])
+    x, other, apart = (int(one[0]) if one.size else None for one in (across, off, beside))
+    return BaseJoints(x, first, other, apart)
 
 
-def base_frame(axes: FloatArray, prismatic: BoolArray, joints: tuple[int, int, int]) -> FloatArray:
-    """Pose (…, 4, 4) of the base frame of screws (…, n, 6) at readings of zero, by ``base_joints``."""
-    d, (k, i, j) = directions(axes, prismatic), joints
-    w, u = axes[..., i, :3], axes[..., j, :3]
-    p, r = np.cross(w, axes[..., i, 3:]), np.cross(u, axes[..., j, 3:])
-    normal = np.cross(w, u)
-    along = (np.cross(r - p, u) * normal).sum(axis=-1) / (normal**2).sum(axis=-1)
-    return _frame(np.cross(d[..., 0, :], d[..., k, :]), d[..., 0, :], p + along[..., None] * w)
+def base_frame(
+    axes: FloatArray, prismatic: BoolArray, joints: BaseJoints, near: FloatArray | None = None
+) -> FloatArray:
+    """Pose (…, 4, 4) of the base frame of screws (…, n, 6) at readings of zero, by ``base_joints``.
+
+    near : (…, 3) point whose foot on the first revolute axis is the origin where all axes are parallel to it,
+        or that is the origin without such an axis.
+    Raises InputError if this point is needed and not known.
+    """
+    d, z = directions(axes, prismatic), directions(axes, prismatic)[..., 0, :]
+    origin = _origin(axes, joints, near)
+    if joints.x is not None:
+        return _frame(np.cross(z, d[..., joints.x, :]), z, origin)
+    x = np.cross(axes[..., joints.apart, :3], axes[..., joints.apart, 3:]) - origin
+    return _frame(x - (x * z).sum(axis=-1, keepdims=True) * z, z, origin)
+
+
+def _origin(axes: FloatArray, joints: BaseJoints, near: FloatArray | None) -> FloatArray:
+    """Origin (…, 3) of a base frame, as ``base_frame`` takes it."""
+    if joints.first is not None:
+        w = axes[..., joints.first, :3]
+        p = np.cross(w, axes[..., joints.first, 3:])
+        if joints.other is not None:
+            u = axes[..., joints.other, :3]
+            r, normal = np.cross(u, axes[..., joints.other, 3:]), np.cross(w, u)
+            along = (np.cross(r - p, u) * normal).sum(axis=-1) / (normal**2).sum(axis=-1)
+            return np.asarray(p + along[..., None] * w)
+    if near is None:
+        raise InputError(_ALL_PARALLEL)
+    if joints.first is None:
+        return near
+    return np.asarray(p + ((near - p) * w).sum(axis=-1)[..., None] * w)
 
 
 def in_frame(axes: FloatArray, prismatic: BoolArray, frame: FloatArray) -> FloatArray:
@@ -286,7 +389,7 @@ def changes_of(
 
 def _bodies(models: ProjectiveParameters, c: Calibration, face: Sequence[int]) -> MetricParameters:
     """Bodies (B, …) of models, the first of which decides the bases of frames. Their scale is arbitrary."""
-    G = invariant_upgrade(models.H_hat, c.prismatic)
+    G = upgrade_of(c, models.H_hat, models.M)
     G = G * np.sign(models.M[:, :1] @ G[:, 3, :, None])
     G, M = _right_handed(models, G)
     back = np.linalg.inv(G)
@@ -297,12 +400,19 @@ def _bodies(models: ProjectiveParameters, c: Calibration, face: Sequence[int]) -
     at_reference[:, turning, 3:] = v - w * (w * v).sum(axis=-1, keepdims=True) / (w * w).sum(-1)[..., None]
     axes, to_zero = carried_screws(at_reference, c.prismatic, -c.q_reference)
     axes[:, c.prismatic, :3] = 0.0
-    base = base_frame(axes, c.prismatic, base_joints(axes[0], c.prismatic))
+    near, eye = None, None
+    if c.boards is not None:
+        middle, eye = homogeneous(M[:, [*face]].mean(axis=1)), _centers(models.P[:, 0] @ back)
+        near, eye = (
+            (to_zero @ point[..., None])[:, :3, 0] if moves else point[:, :3]
+            for point, moves in ((middle, c.mount != TOOL), (eye, True))
+        )
+    base = base_frame(axes, c.prismatic, base_joints(axes[0], c.prismatic), near)
     inverse = rigid_inverse(base)
     # The frame on the last link, at the reference.
     if c.mount == TOOL:
         backward, types = axes[:, ::-1], c.prismatic[::-1]
-        flange = base_frame(backward, types, base_joints(backward[0], types))
+        flange = base_frame(backward, types, base_joints(backward[0], types), eye)
         hand = rigid_inverse(to_zero) @ flange
         of_cameras, of_markers = hand, base
     else:
@@ -332,6 +442,12 @@ def _bodies_by_flange(models: ProjectiveParameters, c: Calibration, chart: Flang
     B = len(P)
     axes = np.broadcast_to(screws(chart.H_hat), (B, 6, 6)).copy()
     return MetricParameters(P, models.lens, axes, np.broadcast_to(chart.T, (B, 4, 4)).copy(), markers)
+
+
+def _centers(P: FloatArray) -> FloatArray:
+    """Centres (B, 4) of cameras (B, 3, 4), their last coordinate one."""
+    center = np.linalg.svd(P)[2][:, 3]
+    return np.asarray(center / center[:, 3:])
 
 
 def _to_known(H_hat: FloatArray, known: FloatArray) -> FloatArray:
@@ -394,6 +510,17 @@ def _length_of(body: MetricParameters, between: Scale, marker: list[int], prisma
     if between == "tags":
         _require_squares(lengths[0], sides)
     return np.asarray(lengths.mean(axis=-1))
+
+
+def _pitch_of_boards(c: Calibration) -> tuple[float | None, Scale]:
+    """Length of a row of the first board of known size, m, and its ends; None and ``joint`` without one."""
+    for board in () if c.boards is None else map(StatedBoard.of, c.boards.tolist()):
+        ends = [number for number in board.longest if number in c.marker]
+        if board.pitch_m is not None and len(ends) == 2:
+            return float(
+                np.linalg.norm(np.diff(board.places_of(np.array(ends)), axis=0))
+            ) * board.pitch_m, ends
+    return None, "joint"
 
 
 def _known_indices(numbers: Sequence[int], marker: list[int]) -> list[int]:
@@ -460,6 +587,8 @@ class Metric:
     ) -> Self:
         """Upgrade a calibration, by the factor of its covariance; the rest as for ``ImageModel.metric``."""
         between = between if isinstance(between, str) else np.ravel(between).tolist()
+        if between == "joint" and length_m is None and c.flange_chart is None and not c.prismatic.any():
+            length_m, between = _pitch_of_boards(c)
         if between == "joint" and length_m is not None:
             raise InputError(
                 f"metric: a length of {length_m} m without its ends: name them, such as two markers; "

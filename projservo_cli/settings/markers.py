@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator, Sequence
+from itertools import pairwise
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -9,7 +10,7 @@ from pydantic import Field, PlainValidator, Strict, WithJsonSchema
 from scipy.spatial.transform import Rotation
 
 from projservo_cli.detection.finders import LEAST_ROWS, Board
-from projservo_cli.records import CORNERS, FloatArray
+from projservo_cli.records import CORNERS, LEAST_CORNERS, FloatArray, StatedBoard
 from projservo_cli.settings.sections import Note, Pose, Positive, Section, Text, Vector3, Whole
 
 GROUND = 4.0 / 3.0
@@ -75,6 +76,24 @@ class BoardSettings(Section):
             yield (key,), "is of the tags on a board of kind charuco, and a chessboard has none"
 
 
+_Corners = Annotated[int, Strict(), Field(ge=LEAST_CORNERS, le=1000)]
+
+
+class KnownBoard(Section):
+    """A board whose corners are markers of a table, numbered row by row: its shape is known."""
+
+    first: Whole = Field(0, description="number of the marker at its first corner")
+    columns: _Corners = Field(description="corners in a row, of a chessboard its inner ones")
+    rows: _Corners = Field(description="rows of corners")
+    pitch_mm: Positive | None = Field(None, description="distance of neighbouring corners; null if unknown")
+
+    @property
+    def stated(self) -> StatedBoard:
+        """The board as a calibration takes it."""
+        pitch_m = None if self.pitch_mm is None else 1e-3 * self.pitch_mm
+        return StatedBoard(self.first, self.columns, self.rows, pitch_m)
+
+
 def _tag(number: int, size_m: float, R: Rotation, t: Sequence[float]) -> Tag:
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = R.as_matrix(), t
@@ -138,6 +157,9 @@ class Markers(Section):
     board: BoardSettings | None = Field(
         None, description="board whose inner corners are the markers, numbered row by row as OpenCV does"
     )
+    boards: tuple[KnownBoard, ...] = Field(
+        (), max_length=100, description="boards whose corners are markers of a table; a fit uses their shape"
+    )
     dictionary: Text | None = Field(
         None,
         description="tag dictionary by its OpenCV name; null: 4X4_50; passed to a robot class that "
@@ -162,6 +184,15 @@ class Markers(Section):
     def pattern(self) -> Board | None:
         """The board as it is detected; None without one."""
         return None if self.board is None else self.board.pattern
+
+    @property
+    def stated_boards(self) -> tuple[StatedBoard, ...]:
+        """Boards whose shape is known, in a table or as they are detected."""
+        known = tuple(one.stated for one in self.boards)
+        if self.board is None:
+            return known
+        rows, columns = self.board.pattern.shape
+        return (*known, StatedBoard(0, columns, rows, self.board.size_m))
 
     @property
     def tag_dictionary(self) -> str | None:
@@ -230,6 +261,9 @@ class Markers(Section):
         for whole, others in (("tags", _BARE), ("board", (*_BARE, "tags", "tag_size_m"))):
             for key in self.given(*others) if self.given(whole) else ():
                 yield (key,), f"{whole} is set as well, whose corners are the markers; keep one"
+        boards = sorted((one.first, one.first + one.columns * one.rows) for one in self.stated_boards)
+        if any(end > first for (_, end), (first, _) in pairwise(boards)):
+            yield ("boards",), "two of them share markers: give each the number of its own first corner"
         if self.board is not None and self.dictionary is not None:
             yield ("dictionary",), "applies to tags: a board has board.dictionary"
         numbers = [tag.number for tag in self.all_tags]

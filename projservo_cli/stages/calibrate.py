@@ -163,6 +163,7 @@ def estimate(
             max_predicted_px=asked.max_predicted_px,
             mount=seen.mount,
             joint_model=asked.joint_model,
+            boards=asked.boards,
             fitted=judge,
             progress=progress,
         )

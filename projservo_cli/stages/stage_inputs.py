@@ -8,7 +8,7 @@ import numpy as np
 
 from projservo_cli.detection.finders import Board
 from projservo_cli.image_size import ImageSize
-from projservo_cli.records import TOOL, Calibration, FloatArray, InputError, JointLimits
+from projservo_cli.records import TOOL, Calibration, FloatArray, InputError, JointLimits, StatedBoard
 from projservo_cli.result_hashes import File, digest, encoded
 from projservo_cli.robots.contract import Bounds
 from projservo_cli.robots.joint_limits import Joints
@@ -191,6 +191,7 @@ class Estimation:
     cross_validate: int | None = None  # parts into which poses are divided to predict each from the others
     max_predicted_px: float | None = None  # error by deviations from the model that is accepted, px
     joint_model: str | tuple[str, ...] | None = None  # auto, or curves of joints to fit
+    boards: tuple[StatedBoard, ...] = ()  # boards whose corners are markers, of known shape
 
 
 @dataclass(frozen=True, eq=False)

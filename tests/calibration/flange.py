@@ -11,6 +11,14 @@ from projservo_cli.store.observation_tables import to_csv
 K = np.array([[905.0, 0.0, 652.0], [0.0, 903.0, 473.0], [0.0, 0.0, 1.0]])
 FACING = Rotation.from_rotvec([np.pi, 0.0, 0.0])
 HAND = rigid(Rotation.from_rotvec([0.1, -0.05, 1.2]), [0.03, 0.05, 0.04])
+# Cameras on the flange, and in the base; the board on the flange, and on the table.
+HANDS = HAND, rigid(Rotation.from_rotvec([0.1, 0.1, 1.1]), [-0.05, 0.05, 0.04])
+CAMERAS = (
+    rigid(Rotation.from_rotvec([0.0, 0.0, 0.1]), [0.5, 0.0, -0.5]),
+    rigid(Rotation.from_rotvec([0.1, 0.35, 0.0]), [0.15, 0.1, -0.45]),
+)
+BOARD_ON_FLANGE = rigid(Rotation.from_rotvec([0.0, np.pi, 0.3]), [0.02, 0.01, 0.0])
+BOARD_ON_TABLE = rigid(Rotation.identity(), [0.5, 0.0, 0.0])
 PITCH = 0.025
 SIZE = 1280, 960
 
@@ -28,19 +36,19 @@ def board():
     return PITCH * np.c_[x.ravel() - 3.5, y.ravel() - 2.5, np.zeros(48)]
 
 
-def images(T, mount, rng, sigma_px):
-    """Pixels (K, 1, 48, 2) of a board on the flange, or on a table before a camera on the flange."""
+def images(T, mount, rng, sigma_px, corners=None, views=1):
+    """Pixels (K, V, 48, 2) of a board (48, 3), on the flange or on a table before cameras on the flange."""
     if mount == WORLD:
-        base_of = T @ rigid(Rotation.from_rotvec([0.0, np.pi, 0.3]), [0.02, 0.01, 0.0])
-        camera = rigid(FACING * FACING * Rotation.from_rotvec([0.0, 0.0, 0.1]), [0.5, 0.0, -0.5])
-        to_camera = np.broadcast_to(rigid_inverse(camera), T.shape)
+        base_of = T @ BOARD_ON_FLANGE
+        to_cameras = [np.broadcast_to(rigid_inverse(camera), T.shape) for camera in CAMERAS[:views]]
     else:
-        base_of = np.broadcast_to(rigid(Rotation.identity(), [0.5, 0.0, 0.0]), T.shape)
-        to_camera = rigid_inverse(T @ HAND)
-    points = np.c_[board(), np.ones(48)] @ (to_camera @ base_of).swapaxes(1, 2)
-    m = points[..., :3] @ K.T
+        base_of = np.broadcast_to(BOARD_ON_TABLE, T.shape)
+        to_cameras = [rigid_inverse(T @ hand) for hand in HANDS[:views]]
+    X = np.c_[board() if corners is None else corners, np.ones(48)]
+    m = np.stack([X @ (to_camera @ base_of).swapaxes(1, 2) for to_camera in to_cameras], axis=1)
+    m = m[..., :3] @ K.T
     pixels = m[..., :2] / m[..., 2:]
-    return (pixels + sigma_px * rng.standard_normal(pixels.shape))[:, None]
+    return pixels + sigma_px * rng.standard_normal(pixels.shape)
 
 
 def write_recording(folder, mount, rng, names=("images", "poses"), count=25):

@@ -158,12 +158,18 @@ def test_all_forms_of_a_pose_are_one(tmp_path):
 
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason="no data of others beside the project")
-@pytest.mark.parametrize(("folder", "mount", "bound_px"), [("fixed", WORLD, 0.101), ("hand", TOOL, 0.118)])
-def test_poses_of_others_predict_held_out_images_at_the_bound(projservo, tmp_path, folder, mount, bound_px):
-    """Bounds of these designs with points free; the command line finds the camera where it is."""
+@pytest.mark.parametrize(
+    ("folder", "mount", "bounds_px"), [("fixed", WORLD, (0.101, 0.037)), ("hand", TOOL, (0.118, 0.052))]
+)
+@pytest.mark.parametrize("board", [(), ("--board", "chessboard:8x6:25mm")])
+def test_poses_of_others_predict_held_out_images_at_the_bound(
+    projservo, tmp_path, folder, mount, bounds_px, board
+):
+    """Bounds of these designs with points free and with the board's shape; the camera is where it is."""
+    bound_px = bounds_px[len(board) > 0]
     data, run = SHARED / "flange" / folder, str(tmp_path / "run")
     trained = "--data", str(data / "train.csv"), "--readings", str(data / "train_poses.csv")
-    found = projservo("calibrate", *trained, "--mount", mount, "-o", run, "--json")
+    found = projservo("calibrate", *trained, *board, "--mount", mount, "-o", run, "--json")
     value = json.loads(found.out)
     assert (found.code, value["readings"], value["joints"], value["usable"]) == (0, "flange", [], True)
     new = "--data", str(data / "test.csv"), "--readings", str(data / "test_poses.csv")

@@ -69,9 +69,10 @@ class Tracks:
         """Move the wanted markers (m,) to where most of their detections agree within a noise σ, px.
 
         Candidates are the current point, and those triangulated from observations by both views, or from
-        two poses if there is one view.
+        two poses if there is one view. Markers on a board of known shape stay.
         """
         detections, M = self.detections, self.params.M[:, :3].copy()
+        wanted = wanted & ~detections.on_board
         rows = np.flatnonzero(wanted[detections.marker_of])
         best = np.full(len(M), np.inf)
         for number in range(-1, _CANDIDATES):
@@ -148,6 +149,7 @@ class Tracks:
             M[some, :3], used[:, rows] = self._without_misfits(
                 M[some, :3], rows, marker, used[:, rows], sigma
             )
+        M[self.detections.on_board] = self.params.M[self.detections.on_board]
         return M, used
 
     def _without_misfits(
