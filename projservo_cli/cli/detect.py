@@ -1,6 +1,7 @@
 """The command ``detect``: markers in images, into a table."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -8,18 +9,45 @@ from projservo_cli.cli import options as option
 from projservo_cli.cli.output import Console
 from projservo_cli.cli.program import main
 
+if TYPE_CHECKING:
+    from projservo_cli.detection.images import ImageSeries
+
 
 @main.command(
     "detect", epilog="Example: projservo detect images/left images/right --readings q.csv --output tags.csv"
 )
-@click.argument("images", nargs=-1, required=True, metavar="LEFT RIGHT | NAME=IMAGES...")
+@click.argument("images", nargs=-1, metavar="LEFT RIGHT | NAME=IMAGES...")
 @option.output(metavar="TABLE", help="Observation table to write (CSV).", required=True)
 @click.option(
     "--readings",
     metavar="CSV",
     type=click.Path(),
-    required=True,
     help="Readings, a row per pose: q1 ... qN or a pose of the flange, perhaps pose or left, right.",
+)
+@click.option(
+    "--bag",
+    metavar="FILE",
+    type=option.PATH,
+    help="A bag with images and readings instead: .bag, .mcap, or a folder of ROS 2.",
+)
+@click.option(
+    "--images",
+    "topics",
+    metavar="NAME=TOPIC...",
+    multiple=True,
+    help="Topics of the images of a bag, each with the name of its camera.",
+)
+@click.option(
+    "--readings-topic", metavar="TOPIC", help="Readings of a bag: a topic of JointState, PoseStamped or tf."
+)
+@click.option(
+    "--frames", metavar="BASE FLANGE", nargs=2, help="Frames of tf: the flange, and the base it moves in."
+)
+@click.option(
+    "--joint-names",
+    metavar="NAME,...",
+    default="",
+    help="Joints of JointState that are q1 ... qN. Default: those of most messages, in their order.",
 )
 @click.option(
     "--dictionary",
@@ -48,7 +76,12 @@ def _detect(
     *,
     images: tuple[str, ...],
     output: Path,
-    readings: str,
+    readings: str | None,
+    bag: Path | None,
+    topics: tuple[str, ...],
+    readings_topic: str | None,
+    frames: tuple[str, str] | None,
+    joint_names: str,
     dictionary: str,
     board: str | None,
     points: str,
@@ -72,35 +105,37 @@ def _detect(
     diagonals. With --board the markers are its inner corners, numbered row by row as OpenCV does; a
     chessboard of two odd or two even sides looks the same turned by 180°, and calibrate turns its numbering
     right. Readings are copied as they are: say --joint-unit deg on calibrate if they are degrees.
+
+    A bag of ROS 1 or 2 (--bag) brings images and readings along. The poses are the stops of the robot, each
+    with one image of each camera; images in motion are kept for the delay of the cameras. Needs rosbags: pip
+    install '.[bags]'.
     """
     import numpy as np
 
     from projservo_cli.detection.finders import Board, finder_of
-    from projservo_cli.detection.images import hidden_images, pair_images
     from projservo_cli.detection.observation import observe_tags
-    from projservo_cli.store.observation_tables import read_joint_list, write_table
+    from projservo_cli.store.observation_tables import write_table
 
     option.require_new(output, force=force)
     if board is not None and points == "centers":
         raise click.UsageError("--points centers: is of tags; a board has corners: leave out one of both")
     finder = finder_of(None if board is None else Board.of(board), dictionary)
-    sources = _sources(images)
-    # Readings as they are, whatever their unit.
-    joints = read_joint_list(readings, joint_unit="rad", view=tuple(sources), flange=True)
-    series = pair_images(sources, joints, readings)
-    hidden = [file for side in sources.values() for file in hidden_images(side)]
-    if hidden:
-        console.say(
-            f"detect: {len(hidden)} hidden files such as {hidden[0]} are no images, and were left out"
-        )
+    if bag is None:
+        series, extra = _of_files(console, images, readings)
+    else:
+        if readings is not None or readings_topic is None:
+            raise click.UsageError("--bag: name the readings by --readings-topic, not by --readings")
+        chosen = tuple(name for name in joint_names.split(",") if name)
+        series, extra = _of_bag(console, bag, (*topics, *images), readings_topic, frames, chosen)
     observation, found = observe_tags(series, finder, points, console.progress)
     write_table(observation, output)
-    seen, whole = np.isfinite(observation.images[..., 0]), "both" if len(sources) == 2 else "all"
-    alone = {name: int((seen[:, v] & (seen.sum(axis=1) == 1)).sum()) for v, name in enumerate(sources)}
+    rest, names = observation.at_rest, series.view
+    seen, whole = np.isfinite(rest.images[..., 0]), "both" if len(names) == 2 else "all"
+    alone = {name: int((seen[:, v] & (seen.sum(axis=1) == 1)).sum()) for v, name in enumerate(names)}
     unseen = int((~seen.any(axis=1)).sum())
     value = {
         "table": output.resolve(),
-        "poses": len(observation.pose),
+        "poses": len(rest.pose),
         "board": board,
         "tags": found.tags if board is None else [],
         "markers": len(observation.marker),
@@ -110,7 +145,7 @@ def _detect(
         "ambiguous": found.ambiguous,
         "unrefined": found.unrefined,
         "empty_images": found.empty,
-        "hidden_files": len(hidden),
+        **extra,
     }
     only = ", ".join(f"{name} only {count}" for name, count in alone.items())
     words = (
@@ -122,6 +157,55 @@ def _detect(
         else "  images without the board: {empty_images}",
     )
     console.report(value, [*(text.format_map(value) for text in words), f"table: {output}"])
+
+
+def _of_files(
+    console: Console, images: tuple[str, ...], readings: str | None
+) -> tuple["ImageSeries", dict[str, Any]]:
+    """Images of files with the readings of a table, and what else to report."""
+    from projservo_cli.detection.images import hidden_images, pair_images
+    from projservo_cli.store.observation_tables import read_joint_list
+
+    if not images or readings is None:
+        raise click.UsageError("give the images and '--readings', or a '--bag'")
+    sources = _sources(images)
+    # Readings as they are, whatever their unit.
+    joints = read_joint_list(readings, joint_unit="rad", view=tuple(sources), flange=True)
+    series = pair_images(sources, joints, readings)
+    hidden = [file for side in sources.values() for file in hidden_images(side)]
+    if hidden:
+        console.say(
+            f"detect: {len(hidden)} hidden files such as {hidden[0]} are no images, and were left out"
+        )
+    return series, {"hidden_files": len(hidden)}
+
+
+def _of_bag(
+    console: Console,
+    path: Path,
+    topics: tuple[str, ...],
+    readings: str,
+    frames: tuple[str, str] | None,
+    joint_names: tuple[str, ...],
+) -> tuple["ImageSeries", dict[str, Any]]:
+    """Images and readings of a bag, which stays open until the command ends, and what else to report."""
+    from projservo_cli.detection.bags import bag_series, open_bag
+
+    if not topics:
+        raise click.UsageError("--bag: name the topics of the images, --images NAME=TOPIC ...")
+    bag = click.get_current_context().with_resource(open_bag(path))
+    found = bag_series(bag, _sources(topics), readings, frames, joint_names, console.progress)
+    counts = [
+        f"{name}: images " + ", ".join(f"{word} {count}" for word, count in fate.items())
+        for name, fate in found.fate.items()
+    ]
+    for note in [*found.notes, *counts]:
+        console.say(f"detect: {note}")
+    moving = found.series.moving
+    return found.series, {
+        "poses_in_motion": 0 if moving is None else int((moving > 0).sum()),
+        "images": found.fate,
+    }
 
 
 def _sources(images: tuple[str, ...]) -> dict[str, str]:

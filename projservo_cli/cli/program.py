@@ -111,7 +111,9 @@ class _Group(click.Group):
 
     def _sorted(self, ctx: click.Context, args: list[str]) -> tuple[list[str], list[str], list[str]]:
         """Words, options with their values, and their flags, separated by click's parser word by word."""
-        params = [*self.params, *(param for command in self.commands.values() for param in command.params)]
+        # Of options of one name, as --frames, that of the command which is called comes last and counts.
+        called = sorted(self.commands.values(), key=lambda command: command.name in args)
+        params = [*self.params, *(param for command in called for param in command.params)]
         options = {param.name: param for param in params if isinstance(param, click.Option)}
         every = click.Command(None, params=[*options.values()])
         words: list[str] = []

@@ -11,7 +11,7 @@ import numpy as np
 from projservo_cli import messages
 from projservo_cli.findings import REFUSES, Finding
 from projservo_cli.image_size import natural
-from projservo_cli.records import FloatArray, InputError, JointList
+from projservo_cli.records import FloatArray, InputError, IntArray, JointList
 
 _SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp"})
 # Share of the mean grey value by which the values of the four pixels of a cell of a Bayer mosaic differ at
@@ -32,6 +32,9 @@ class ImageSeries(NamedTuple):
     view: tuple[str, ...]  # names of the cameras
     joints: JointList  # numbers of the poses and their readings
     images: Sequence[tuple[StoredImage | None, ...]]  # of each pose, one of each camera, None without one
+    moving: IntArray | None = None  # (K,) number of the motion of each pose, 0 at rest
+    t_q: FloatArray | None = None  # (K,) time of the readings, s
+    t_view: FloatArray | None = None  # (K, V) stamps of the images, s
 
 
 @dataclass(frozen=True)

@@ -93,6 +93,9 @@ def observe_tags(
         sigma=sigma,
         view=series.view,
         flange_chart=joints.flange_chart,
+        moving=series.moving,
+        t_q=series.t_q,
+        t_view=series.t_view,
     )
     if not np.isfinite(images).any():
         raise messages.failed([Finding("rejected_markers", REFUSES, amount=images[..., 0].size, unit="1")])

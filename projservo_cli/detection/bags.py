@@ -1,0 +1,288 @@
+"""Bags of ROS 1 and ROS 2: images of topics, and readings of joints, poses or a chain of transforms.
+
+Stamps are those of headers; where a header has none, the time at which the message was received.
+"""
+
+import re
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from projservo_cli import messages
+from projservo_cli.detection.bag_readings import JOINTS, POSE, TREES, Readings
+from projservo_cli.detection.images import ImageSeries, decoded, opencv, unfit
+from projservo_cli.detection.stops import STOP_S, shots
+from projservo_cli.records import FloatArray, InputError, JointList
+
+_IMAGE, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+_STATIC = "_static"  # ends the topic of transforms that do not change
+# Messages from one report of progress to the next.
+_OFTEN = 50
+# Channels of the encodings of sensor_msgs/image_encodings.hpp, and how OpenCV makes grey of them.
+_GREY_OF = {
+    "mono": (1, ""),
+    **{name: (len(name), f"{name.upper()}2GRAY") for name in ("bgr", "rgb", "bgra", "rgba")},
+    **{f"bayer_{name}": (1, f"Bayer{name.upper()}2GRAY") for name in ("rggb", "bggr", "gbrg", "grbg")},
+    "yuv422_": (2, "YUV2GRAY_UYVY"),
+    "yuv422_yuy2_": (2, "YUV2GRAY_YUY2"),
+}
+_ALSO = {
+    "8uc1": "mono8",
+    "8uc3": "bgr8",
+    "8uc4": "bgra8",
+    "16uc1": "mono16",
+    "yuv422": "yuv422_8",
+    "yuv422_yuy2": "yuv422_yuy2_8",
+}
+
+
+class _Place(NamedTuple):
+    """Place of a message in a bag."""
+
+    topic: str
+    received: int  # ns
+    before: int  # number of messages of the topic before it that were received at the same time
+
+
+class Bag:
+    """An open bag."""
+
+    def __init__(self, path: Path, reader: Any) -> None:
+        self.path = path
+        self._reader = reader
+
+    def kind(self, topic: str) -> str:
+        """Type of the messages of a topic. Raises InputError, which lists all topics, if there is none."""
+        kinds = {connection.topic: str(connection.msgtype) for connection in self._reader.connections}
+        if topic not in kinds:
+            raise InputError(f"{self.path}: no topic {topic}; it has: {', '.join(sorted(kinds)) or 'none'}")
+        return kinds[topic]
+
+    def has(self, topic: str) -> bool:
+        """Whether there is a topic."""
+        return any(connection.topic == topic for connection in self._reader.connections)
+
+    def messages(
+        self, topics: Sequence[str], progress: Callable[[str, int, int], None]
+    ) -> Iterator[tuple[_Place, Any]]:
+        """Read all messages of topics, in the order in which they were received."""
+        wanted = [connection for connection in self._reader.connections if connection.topic in topics]
+        total = sum(connection.msgcount for connection in wanted)
+        last = dict[str, _Place]()
+        for done, (connection, received, content) in enumerate(self._raw(wanted), 1):
+            place = _Place(connection.topic, received, 0)
+            if (before := last.get(connection.topic)) and before.received == received:
+                place = before._replace(before=before.before + 1)
+            last[connection.topic] = place
+            yield place, self._message(connection, content)
+            if done % _OFTEN == 0 or done == total:
+                progress("read", done, max(done, total))
+
+    def message(self, place: _Place) -> Any:
+        """Read one message."""
+        wanted = [connection for connection in self._reader.connections if connection.topic == place.topic]
+        found = self._raw(wanted, start=place.received, stop=place.received + 1)
+        connection, _, content = next(islice(found, place.before, None))
+        return self._message(connection, content)
+
+    def _raw(self, wanted: list[Any], **times: int) -> Iterator[tuple[Any, int, bytes]]:
+        with self._reading():
+            yield from self._reader.messages(wanted, **times)
+
+    def _message(self, connection: Any, content: bytes) -> Any:
+        with self._reading():
+            return self._reader.deserialize(content, connection.msgtype)
+
+    @contextmanager
+    def _reading(self) -> Iterator[None]:
+        """Turn errors of rosbags, which have many types in a file that is cut off, into InputErrors."""
+        try:
+            yield
+        except Exception as error:
+            raise InputError(
+                f"{self.path}: a message cannot be read: {error}; record or copy it again"
+            ) from error
+
+
+@contextmanager
+def open_bag(path: Path) -> Iterator[Bag]:
+    """Open a bag: a file of ROS 1 or MCAP, or a folder of ROS 2. Raises InputError if it is none."""
+    try:
+        from rosbags.highlevel import AnyReader
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError as error:
+        raise InputError("bags need rosbags: pip install '.[bags]'") from error
+    try:  # early bags of ROS 2 say nothing of their types
+        reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+        reader.open()
+    except Exception as error:
+        raise InputError(
+            f"{path}: no bag that can be read: {error}; give a .bag or .mcap file, or a folder of ROS 2"
+        ) from error
+    try:
+        yield Bag(path, reader)
+    finally:
+        reader.close()
+
+
+@dataclass(frozen=True)
+class BagImage:
+    """Image of a message."""
+
+    bag: Bag
+    place: _Place
+    bits: int  # that grey values of 16 bit take in this topic
+
+    def __str__(self) -> str:
+        return f"{self.bag.path}: {self.place.topic} at {self.place.received * 1e-9:.3f} s"
+
+    def grey(self) -> FloatArray:
+        """Grey values (height, width). Raises InputError if the message holds none."""
+        message = self.bag.message(self.place)
+        if message.__msgtype__ == _COMPRESSED:
+            return decoded(message.data.tobytes(), str(self))
+        pixels, conversion = _pixels(message, str(self))
+        if not conversion and pixels.dtype == np.uint8 and (wrong := unfit(pixels)):
+            raise InputError(f"{self}: {messages.sentence_and_remedy(wrong)}")
+        if conversion:
+            cv = opencv()
+            pixels = cv.cvtColor(pixels, getattr(cv, f"COLOR_{conversion}"))
+        grey = pixels.astype(np.float64)
+        return grey if pixels.dtype == np.uint8 else np.asarray(grey * 255.0 / (2**self.bits - 1))
+
+
+def _pixels(message: Any, where: str) -> tuple[Any, str]:
+    """Values (height, width) or (height, width, channels) of an image, and how OpenCV makes grey of them."""
+    encoding = message.encoding.strip().lower()
+    form = re.fullmatch(r"(.*?)(8|16)", _ALSO.get(encoding, encoding))
+    if form is None or form[1] not in _GREY_OF:
+        raise InputError(
+            f"{where}: the encoding {message.encoding!r} is not known; record mono8, bgr8, rgb8, "
+            "bayer_rggb8, mono16 or the like, or compressed images"
+        )
+    channels, conversion = _GREY_OF[form[1]]
+    height, width, step, size = message.height, message.width, message.step, int(form[2]) // 8
+    row = width * channels * size
+    if not row or step < row or len(message.data) < height * step:
+        raise InputError(
+            f"{where}: {len(message.data)} bytes in rows of {step} hold no {width}×{height} pixels of "
+            f"{message.encoding}; record it again"
+        )
+    values = np.ascontiguousarray(message.data[: height * step].reshape(height, step)[:, :row])
+    values = values.view(f"{'>' if message.is_bigendian else '<'}u{size}").astype(f"u{size}")
+    return values.reshape((height, width, channels) if channels > 1 else (height, width)), conversion
+
+
+class BagSeries(NamedTuple):
+    """Images and readings of a bag, and what is to be said of them."""
+
+    series: ImageSeries
+    fate: dict[str, dict[str, int]]  # of each camera, how many images became what
+    notes: list[str]
+
+
+def bag_series(
+    bag: Bag,
+    topics: Mapping[str, str],
+    source: str,
+    frames: tuple[str, str] | None,
+    names: Sequence[str],
+    progress: Callable[[str, int, int], None],
+) -> BagSeries:
+    """Read images and readings of a bag, and pair them at stops and in motion.
+
+    topics : of the images, by the name of each camera.
+    source : topic of the readings; frames : base and flange, if these are transforms; names : of the joints,
+        in their order, by default all in the order of the messages.
+    Raises InputError if a topic is missing or has no images or readings, or no stop shows in all cameras.
+    """
+    kind = bag.kind(source)
+    if kind not in (JOINTS, POSE, *TREES):
+        raise InputError(f"{bag.path}: {source} has {kind}; give a topic of JointState, PoseStamped or tf")
+    if kind in TREES and frames is None:
+        raise InputError(f"{bag.path}: {source} has transforms; name two frames, --frames BASE FLANGE")
+    if kind not in TREES and frames is not None:
+        raise InputError(f"{bag.path}: {source} has {kind}, no transforms; leave out --frames")
+    for topic in topics.values():
+        if (shown := bag.kind(topic)) not in (_IMAGE, _COMPRESSED):
+            raise InputError(f"{bag.path}: {topic} has {shown}; give a topic of Image or CompressedImage")
+    read = [source, source + _STATIC] if kind in TREES and bag.has(source + _STATIC) else [source]
+    taken = {topic: list[tuple[int, _Place]]() for topic in topics.values()}
+    where, notes, unstamped, peak = f"{bag.path}: {source}", list[str](), Counter[str](), Counter[str]()
+    readings = Readings(where, notes)
+    for place, message in bag.messages([*read, *taken], progress):
+        if kind in TREES and place.topic in read:
+            for part in message.transforms:
+                T, constant = part.transform, place.topic != source
+                stamp = 0 if constant else _stamp(part.header, place, unstamped)
+                readings.add_pose(
+                    stamp,
+                    T.translation,
+                    T.rotation,
+                    part.header.frame_id,
+                    part.child_frame_id,
+                )
+            continue
+        stamp = _stamp(message.header, place, unstamped)
+        if place.topic in taken:
+            taken[place.topic].append((stamp, place))
+            if message.__msgtype__ == _IMAGE and "16" in message.encoding:
+                values = _pixels(message, f"{bag.path}: {place.topic}")[0]
+                peak[place.topic] = max(peak[place.topic], int(values.max()))
+        elif kind == JOINTS:
+            readings.add_joints(stamp, message)
+        else:
+            readings.add_pose(stamp, message.pose.position, message.pose.orientation)
+    first, stream = readings.stream(frames, names)
+    notes += [
+        f"{bag.path}: {topic}: {count} headers have no stamp: the time of receipt stands for it"
+        for topic, count in unstamped.items()
+        if count
+    ]
+    bits = {topic: max(8, most.bit_length()) for topic, most in peak.items()}
+    notes += [f"{bag.path}: {topic}: {n} of 16 bit are used, and scaled to 8" for topic, n in bits.items()]
+    images = [
+        [
+            (1e-9 * (stamp - first), BagImage(bag, place, bits.get(topic, 8)))
+            for stamp, place in sorted(taken[topic])
+        ]
+        for topic in topics.values()
+    ]
+    for topic, row in zip(topics.values(), images, strict=True):
+        if not row or row[-1][0] < 0.0 or row[0][0] > stream.t[-1]:
+            raise InputError(
+                f"{bag.path}: {topic}: {len(row)} images, none of the time of the readings of {source}; "
+                "record both together, with stamps of one clock"
+            )
+    found = shots(stream, [np.array([t for t, _ in row]) for row in images])
+    if not (found.moving == 0).any():
+        raise InputError(
+            f"{where}: the robot stands still nowhere for {STOP_S:g} s with an image of each camera; stop it "
+            "at each pose while you record"
+        )
+    moves, chart = found.moving.any(), stream.chart
+    t_view = np.array(
+        [[images[v][i][0] if i >= 0 else np.nan for v, i in enumerate(row)] for row in found.image]
+    )
+    series = ImageSeries(
+        tuple(topics),
+        JointList(
+            np.arange(len(found.q)), found.q, True, flange_chart=None if chart is None else chart.record
+        ),
+        [tuple(images[v][i][1] if i >= 0 else None for v, i in enumerate(row)) for row in found.image],
+        *((found.moving, found.t_q, t_view) if moves else ()),
+    )
+    return BagSeries(series, dict(zip(topics, map(dict, found.fate), strict=True)), notes)
+
+
+def _stamp(header: Any, place: _Place, unstamped: Counter[str]) -> int:
+    """Stamp of a header, ns; when the message was received, and one more in ``unstamped``, if it has none."""
+    stamp = int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec)
+    unstamped[place.topic] += not stamp
+    return stamp or place.received
