@@ -196,7 +196,7 @@ def _of_bag(
     bag = click.get_current_context().with_resource(open_bag(path))
     found = bag_series(bag, _sources(topics), readings, frames, joint_names, console.progress)
     counts = [
-        f"{name}: images " + ", ".join(f"{word} {count}" for word, count in fate.items())
+        f"{name}: {sum(fate.values())} images: " + ", ".join(f"{fate[word]} {word}" for word in sorted(fate))
         for name, fate in found.fate.items()
     ]
     for note in [*found.notes, *counts]:

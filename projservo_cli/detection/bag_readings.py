@@ -37,7 +37,16 @@ class Readings:
         """Take a JointState."""
         self._joints.append((stamp, tuple(message.name), np.asarray(message.position, dtype=np.float64)))
 
-    def add_pose(self, stamp: int, place: Any, turn: Any, parent: str = "", child: str = "") -> None:
+    def add_pose(self, stamp: int, message: Any) -> None:
+        """Take a PoseStamped."""
+        self._add(stamp, message.pose.position, message.pose.orientation, "", "")
+
+    def add_transform(self, stamp: int, message: Any) -> None:
+        """Take a TransformStamped."""
+        T, parent = message.transform, message.header.frame_id
+        self._add(stamp, T.translation, T.rotation, parent, message.child_frame_id)
+
+    def _add(self, stamp: int, place: Any, turn: Any, parent: str, child: str) -> None:
         """Take a pose of a frame in its parent, unless it is none."""
         row = [place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w]
         if np.isfinite(row).all() and abs(np.linalg.norm(row[3:]) - 1.0) <= _UNIT:

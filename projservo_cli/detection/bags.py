@@ -64,14 +64,10 @@ class Bag:
             raise InputError(f"{self.path}: no topic {topic}; it has: {', '.join(sorted(kinds)) or 'none'}")
         return kinds[topic]
 
-    def has(self, topic: str) -> bool:
-        """Whether there is a topic."""
-        return any(connection.topic == topic for connection in self._reader.connections)
-
     def messages(
         self, topics: Sequence[str], progress: Callable[[str, int, int], None]
     ) -> Iterator[tuple[_Place, Any]]:
-        """Read all messages of topics, in the order in which they were received."""
+        """Read all messages of topics, if there are such, in the order in which they were received."""
         wanted = [connection for connection in self._reader.connections if connection.topic in topics]
         total = sum(connection.msgcount for connection in wanted)
         last = dict[str, _Place]()
@@ -212,33 +208,24 @@ def bag_series(
     for topic in topics.values():
         if (shown := bag.kind(topic)) not in (_IMAGE, _COMPRESSED):
             raise InputError(f"{bag.path}: {topic} has {shown}; give a topic of Image or CompressedImage")
-    read = [source, source + _STATIC] if kind in TREES and bag.has(source + _STATIC) else [source]
+    where, notes = f"{bag.path}: {source}", list[str]()
+    unstamped, peak = Counter[str](), Counter[str]()
     taken = {topic: list[tuple[int, _Place]]() for topic in topics.values()}
-    where, notes, unstamped, peak = f"{bag.path}: {source}", list[str](), Counter[str](), Counter[str]()
     readings = Readings(where, notes)
-    for place, message in bag.messages([*read, *taken], progress):
-        if kind in TREES and place.topic in read:
+    for place, message in bag.messages([source, source + _STATIC, *taken], progress):
+        if hasattr(message, "transforms"):
             for part in message.transforms:
-                T, constant = part.transform, place.topic != source
+                constant = place.topic != source
                 stamp = 0 if constant else _stamp(part.header, place, unstamped)
-                readings.add_pose(
-                    stamp,
-                    T.translation,
-                    T.rotation,
-                    part.header.frame_id,
-                    part.child_frame_id,
-                )
-            continue
-        stamp = _stamp(message.header, place, unstamped)
-        if place.topic in taken:
-            taken[place.topic].append((stamp, place))
+                readings.add_transform(stamp, part)
+        elif place.topic in taken:
+            taken[place.topic].append((_stamp(message.header, place, unstamped), place))
             if message.__msgtype__ == _IMAGE and "16" in message.encoding:
                 values = _pixels(message, f"{bag.path}: {place.topic}")[0]
                 peak[place.topic] = max(peak[place.topic], int(values.max()))
-        elif kind == JOINTS:
-            readings.add_joints(stamp, message)
-        else:
-            readings.add_pose(stamp, message.pose.position, message.pose.orientation)
+        elif place.topic == source:
+            add = readings.add_joints if kind == JOINTS else readings.add_pose
+            add(_stamp(message.header, place, unstamped), message)
     first, stream = readings.stream(frames, names)
     notes += [
         f"{bag.path}: {topic}: {count} headers have no stamp: the time of receipt stands for it"
@@ -247,13 +234,10 @@ def bag_series(
     ]
     bits = {topic: max(8, most.bit_length()) for topic, most in peak.items()}
     notes += [f"{bag.path}: {topic}: {n} of 16 bit are used, and scaled to 8" for topic, n in bits.items()]
-    images = [
-        [
-            (1e-9 * (stamp - first), BagImage(bag, place, bits.get(topic, 8)))
-            for stamp, place in sorted(taken[topic])
-        ]
-        for topic in topics.values()
-    ]
+    images = list[list[tuple[float, BagImage]]]()
+    for topic in topics.values():
+        named = [(stamp, BagImage(bag, place, bits.get(topic, 8))) for stamp, place in sorted(taken[topic])]
+        images.append([(1e-9 * (stamp - first), image) for stamp, image in named])
     for topic, row in zip(topics.values(), images, strict=True):
         if not row or row[-1][0] < 0.0 or row[0][0] > stream.t[-1]:
             raise InputError(
@@ -266,18 +250,16 @@ def bag_series(
             f"{where}: the robot stands still nowhere for {STOP_S:g} s with an image of each camera; stop it "
             "at each pose while you record"
         )
-    moves, chart = found.moving.any(), stream.chart
-    t_view = np.array(
-        [[images[v][i][0] if i >= 0 else np.nan for v, i in enumerate(row)] for row in found.image]
-    )
-    series = ImageSeries(
-        tuple(topics),
-        JointList(
-            np.arange(len(found.q)), found.q, True, flange_chart=None if chart is None else chart.record
-        ),
-        [tuple(images[v][i][1] if i >= 0 else None for v, i in enumerate(row)) for row in found.image],
-        *((found.moving, found.t_q, t_view) if moves else ()),
-    )
+    t_view, rows = np.full(found.image.shape, np.nan), list[tuple[BagImage | None, ...]]()
+    for t, numbers in zip(t_view, found.image.tolist(), strict=True):
+        pairs = [images[v][i] if i >= 0 else (np.nan, None) for v, i in enumerate(numbers)]
+        t[:] = [time for time, _ in pairs]
+        rows.append(tuple(image for _, image in pairs))
+    chart = None if stream.chart is None else stream.chart.record
+    joints = JointList(np.arange(len(rows)), found.q, numbered=True, flange_chart=chart)
+    series = ImageSeries(tuple(topics), joints, rows)
+    if found.moving.any():
+        series = series._replace(moving=found.moving, t_q=found.t_q, t_view=t_view)
     return BagSeries(series, dict(zip(topics, map(dict, found.fate), strict=True)), notes)
 
 

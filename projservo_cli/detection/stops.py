@@ -5,6 +5,7 @@ from collections import Counter
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import maximum_filter1d, minimum_filter1d
 from scipy.spatial.transform import Rotation, Slerp
 
 from projservo_cli.geometry.flange import FlangeChart
@@ -18,11 +19,11 @@ _LEAST = 5
 # that range, so that this is below the errors of corners, some hundredths of a pixel.
 _STILL = 2e-4
 # Ranges of noise: of a sample of up to some thousand normal errors, in deviations, and of encoder counts.
-_OF_NOISE, _OF_COUNTS = 8.0, 1.5
+_OF_NOISE, _OF_COUNTS = 8.0, 2.5
 # Lower quartile of the absolute value of a normal variable, and variance of second differences of noise.
 _QUARTILE, _SECOND = 0.3186, 6.0
 # Maximum of what is taken for noise, as a share of the widest range: more is slow motion.
-_MOST_NOISE = 5e-3
+_MOST_NOISE = 0.02
 # Longest time between readings, as a multiple of the median, and widest step of one, over which they are
 # interpolated: half a turn is a joint that passes the end of its circle.
 _GAP, _JUMP = 10.0, math.pi
@@ -32,9 +33,9 @@ _AFTER_S = 0.3
 _MOST_MOVING = 400
 
 # What became of an image.
-AT_REST, MOVING = "taken at stops", "taken in motion"
-REPEATED, UNPAIRED = "more at these stops", "at stops that another camera did not see"
-BEYOND, UNREAD = "more in motion", "without readings at their time"
+AT_REST, REPEATED = "at stops", "more at these stops"
+UNPAIRED = "at stops of which another camera has none"
+MOVING, BEYOND, UNREAD = "in motion", "more in motion", "without readings at their time"
 
 
 class Stream(NamedTuple):
@@ -71,8 +72,9 @@ class Stream(NamedTuple):
         counts = np.where(np.isfinite(counts), counts, 0.0)
         noise = np.maximum(_OF_NOISE * second / (_QUARTILE * math.sqrt(_SECOND)), _OF_COUNTS * counts)
         most = np.maximum(_STILL * span, np.minimum(noise, _MOST_NOISE * span.max()))
-        windows = np.lib.stride_tricks.sliding_window_view(self.q, count, axis=0)
-        still = (windows.max(axis=-1) - windows.min(axis=-1) <= most).all(axis=1)
+        of_windows = slice(count // 2, count // 2 + len(self.t) - count + 1)  # by their middles
+        highest, lowest = maximum_filter1d(self.q, count, axis=0), minimum_filter1d(self.q, count, axis=0)
+        still = ((highest - lowest)[of_windows] <= most).all(axis=1)
         still &= ~np.lib.stride_tricks.sliding_window_view(_gaps(self), count - 1).any(axis=1)
         found = list[list[int]]()
         for first in np.flatnonzero(still).tolist():
@@ -131,18 +133,17 @@ def shots(stream: Stream, stamps: list[FloatArray]) -> Shots:
                 image.append(int(here[np.argmin(np.abs(stamps[v][here] - middle))]))
                 fate[v][image[-1]] = AT_REST
         if whole:
-            q = np.median(stream.q[(stream.t >= begin) & (stream.t <= end)], axis=0)
-            rows.append((middle, q, end, 0, image))
+            taken_at = [float(stamps[v][i]) for v, i in enumerate(image)]
+            near = stream.t >= max(begin, min(taken_at) - STOP_S)
+            near &= stream.t <= min(end, max(taken_at) + STOP_S)
+            q = stream.q[near]
+            rows.append((middle, q[0] + (q - q[0]).mean(axis=0), end, 0, image))  # exact if all are alike
     motion, moved = [], set[int]()
     for v, t in enumerate(stamps):
         motion.append(1 + np.searchsorted(stops[:, 0] + _AFTER_S, t))
         fate[v][(fate[v] == MOVING) & np.isnan(stream.at(t)).any(axis=1)] = UNREAD
         moved |= set(motion[v][fate[v] == MOVING].tolist())
-        late = (
-            t - stops[np.clip(np.searchsorted(stops[:, 0], t) - 1, 0, None), 0] <= _AFTER_S
-            if len(stops)
-            else []
-        )
+        late = np.searchsorted(stops[:, 0], t) >= motion[v]  # the next stop began, and not long ago
         fate[v][(fate[v] == REPEATED) & late & np.isin(motion[v], [*moved])] = MOVING
     every = math.ceil(max(int((one == MOVING).sum()) for one in fate) / _MOST_MOVING)
     kept = sorted(moved)[:: max(every, 1)]
