@@ -316,7 +316,7 @@ def test_a_robot_that_stops_nowhere_is_told_to_stop():
         bag.joints("/joint_states", t, ["a", "b"], [np.sin(t), np.cos(2 * t)])
         bag.image("/left", t, np.zeros((8, 8), dtype=np.uint8))
     bag.close()
-    with pytest.raises(InputError, match="stands still nowhere for 0.3 s"):
+    with pytest.raises(InputError, match=r"stands still nowhere for 0\.3 s"):
         series()
 
 

@@ -114,6 +114,18 @@ def put_poses(folder):
     write_recording(folder, TOOL, rng, ("new", "new_poses"), 8)
 
 
+def put_bag(folder):
+    """A bag of a robot that carries a board from stop to stop, with stamps 50 ms late."""
+    from tests.detection.ros_bags import Bag, Show, put_readings
+
+    show, bag = Show(18, delay=0.05), Bag(folder / "recording", "mcap")
+    put_readings(bag, show, "tf")
+    for side, frames in zip(("left", "right"), show.frames(2), strict=True):
+        for t, image in frames:
+            bag.image(f"/{side}/image_raw", t, image)
+    bag.close()
+
+
 def require_gl():
     """Skip where nothing can be drawn."""
     try:
@@ -257,6 +269,7 @@ def check_paper(folder, names, read):
 
 
 HAS = {
+    "bags": (put_bag,),
     "camera-on-the-hand": (put_hand,),
     "flange-poses": (put_poses,),
     "print-and-mount-tags": (put_tags,),
