@@ -121,6 +121,8 @@ def _detect(
         raise click.UsageError("--points centers: is of tags; a board has corners: leave out one of both")
     finder = finder_of(None if board is None else Board.of(board), dictionary)
     if bag is None:
+        if topics or readings_topic or frames or joint_names:
+            raise click.UsageError("--images, --readings-topic, --frames, --joint-names: are of a --bag")
         series, extra = _of_files(console, images, readings)
     else:
         if readings is not None or readings_topic is None:

@@ -24,11 +24,17 @@ _IMAGE, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 _STATIC = "_static"  # ends the topic of transforms that do not change
 # Messages from one report of progress to the next.
 _OFTEN = 50
+_MOSAIC = "mosaic"
+# Windows of a mosaic, in cells: of the means that are looked at, of the brightest of them, which is white
+# beside each edge of a tag, and over which white is smoothed. On drawn tags before grey and coloured walls
+# corners err 1.01 to 1.1 times as much as with all colours in each pixel, 1.4 times where blue is faint;
+# with interpolated colours 1.3 to 1.9 times.
+_MEAN, _WHITE, _SMOOTH = 5, 31, 61
 # Channels of the encodings of sensor_msgs/image_encodings.hpp, and how OpenCV makes grey of them.
 _GREY_OF = {
     "mono": (1, ""),
     **{name: (len(name), f"{name.upper()}2GRAY") for name in ("bgr", "rgb", "bgra", "rgba")},
-    **{f"bayer_{name}": (1, f"Bayer{name.upper()}2GRAY") for name in ("rggb", "bggr", "gbrg", "grbg")},
+    **{f"bayer_{name}": (1, _MOSAIC) for name in ("rggb", "bggr", "gbrg", "grbg")},
     "yuv422_": (2, "YUV2GRAY_UYVY"),
     "yuv422_yuy2_": (2, "YUV2GRAY_YUY2"),
 }
@@ -146,11 +152,29 @@ class BagImage:
         pixels, conversion = _pixels(message, str(self))
         if not conversion and pixels.dtype == np.uint8 and (wrong := unfit(pixels)):
             raise InputError(f"{self}: {messages.sentence_and_remedy(wrong)}")
-        if conversion:
+        if conversion not in ("", _MOSAIC):
             cv = opencv()
             pixels = cv.cvtColor(pixels, getattr(cv, f"COLOR_{conversion}"))
         grey = pixels.astype(np.float64)
-        return grey if pixels.dtype == np.uint8 else np.asarray(grey * 255.0 / (2**self.bits - 1))
+        if pixels.dtype != np.uint8:
+            grey = grey * 255.0 / (2**self.bits - 1)
+        return _levelled(grey) if conversion == _MOSAIC else np.asarray(grey)
+
+
+def _levelled(mosaic: FloatArray) -> FloatArray:
+    """Grey values (height, width) behind a mosaic of colour filters: white is as bright behind each.
+
+    Tags are black and white, so each pixel shows their edges, which interpolated colours would blur.
+    """
+    cv, (height, width) = opencv(), mosaic.shape
+    cells = np.pad(mosaic, ((0, height % 2), (0, width % 2)), mode="edge")
+    parts = [cells[i::2, j::2] for i in range(2) for j in range(2)]
+    means = [cv.blur(part, (_MEAN, _MEAN)) for part in parts]
+    white = [cv.blur(cv.dilate(mean, np.ones((_WHITE, _WHITE))), (_SMOOTH, _SMOOTH)) for mean in means]
+    most = np.maximum.reduce(white)
+    for part, level in zip(parts, white, strict=True):
+        part *= most / np.maximum(level, 1.0)
+    return np.asarray(np.minimum(cells, 255.0)[:height, :width])
 
 
 def _pixels(message: Any, where: str) -> tuple[Any, str]:

@@ -53,8 +53,7 @@ ENCODINGS = {
     "mono8": (lambda bag, topic, t, image: bag.image(topic, t, image, pad=5), None),
     "jpeg": (lambda bag, topic, t, image: bag.compressed(topic, t, jpeg(image)), jpeg),
     "bayer_gbrg8": (
-        lambda bag, topic, t, image: bag.image(topic, t, mosaic(image, "gbrg"), "bayer_gbrg8"),
-        lambda image: cv2.cvtColor(mosaic(image, "gbrg"), cv2.COLOR_BayerGBRG2GRAY),
+        lambda bag, topic, t, image: bag.image(topic, t, mosaic(image, "gbrg"), "bayer_gbrg8"), None
     ),
     "rgb8": (lambda bag, topic, t, image: bag.image(topic, t, colours(image, 3), "rgb8", pad=2), None),
     "bgra8": (lambda bag, topic, t, image: bag.image(topic, t, colours(image, 4), "bgra8"), None),
@@ -97,11 +96,16 @@ def written(show, shown, path, storage, encoding, readings):
     Path("q.csv").write_text(to_csv(poses))
 
 
-def same(table, files):
-    """Whether the stops of a table of a bag are those of files."""
+def same(table, files, exact):
+    """Whether the stops of a table of a bag are those of files, to the bit or to some thousandths of a px."""
     rest = table.at_rest
-    np.testing.assert_array_equal(rest.images, files.images)
-    np.testing.assert_array_equal(rest.sigma, files.sigma)
+    if exact:
+        np.testing.assert_array_equal(rest.images, files.images)
+        np.testing.assert_array_equal(rest.sigma, files.sigma)
+    else:
+        off = rest.images - files.images
+        assert np.isfinite(off).mean() > 0.95
+        assert np.nanmean(off**2) ** 0.5 < 0.005
     if files.flange_chart is None:
         np.testing.assert_array_equal(rest.q, files.q)
     else:
@@ -130,7 +134,7 @@ def test_a_bag_is_the_table_of_its_images(projservo, storage, encoding, readings
     assert (answer.json["poses"], answer.json["poses_in_motion"]) == (3, 22)
     answer = projservo("detect", "left", "right", "--readings", "q.csv", *DETECT, "-o", "f.csv")
     assert answer.code == 0, answer.err
-    same(read_table("b.csv"), read_table("f.csv"))
+    same(read_table("b.csv"), read_table("f.csv"), exact="bayer" not in encoding)
 
 
 @pytest.mark.parametrize(
@@ -308,6 +312,11 @@ def test_bags_that_make_no_table(projservo, name):
     answer = projservo("detect", *words, *options, "-o", "t.csv", "-q")
     assert (answer.code, answer.err.count("\n")) == (2, 1), answer.err
     assert message in answer.err
+
+
+def test_options_of_a_bag_need_one(projservo):
+    answer = projservo("detect", "a", "b", "--readings", "q.csv", *OPTIONS["tf"], "-o", "t.csv")
+    assert (answer.code, "are of a --bag" in answer.err) == (2, True)
 
 
 def test_a_robot_that_stops_nowhere_is_told_to_stop():
