@@ -257,8 +257,8 @@ CALIBRATION = {
         limit="the unit of joints",
     ),
     "inverse_poses": Row(
-        "these look like poses of the base in the flange",
-        "invert them: p_base = T p_flange",
+        "these look like poses of the base in the flange, or the cameras are {there}: images are alike",
+        "invert the poses (p_base = T p_flange), or give --mount {name} (data.mount)",
         limit="inverse poses",
     ),
     "transposed_rotations": Row(

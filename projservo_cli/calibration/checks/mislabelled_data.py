@@ -47,6 +47,7 @@ class Relabelling(NamedTuple):
     detections: Detections
     q_reference: FloatArray  # (n,) rad or m
     noise_px: float = np.nan  # that a complete fit leaves
+    unread: int | None = None  # row of the pose that is left without a reading of its own
 
     @property
     def problem(self) -> LeastSquares:
@@ -73,7 +74,8 @@ class _Data(NamedTuple):
         """Return the relabelling by which images come one pose late, or early, from a row of a pose on."""
         q, subject = self.detections.q, Subject(poses=(int(self.detections.pose[at]),))
         later = q[at - 1 : -1] if code == _SHIFTED[0] else np.vstack([q[at + 1 :], q[-1:]])
-        return self.with_(code, subject, "1", len(later), q=np.vstack([q[:at], later]))
+        one = self.with_(code, subject, "1", len(later), q=np.vstack([q[:at], later]))
+        return one if code == _SHIFTED[0] else one._replace(unread=len(q) - 1)
 
     def dated(self, one: Relabelling, found: Solution) -> Relabelling:
         """Return delayed or early images, from the pose on at which a fit shows it."""
@@ -125,8 +127,11 @@ def _mounts(data: _Data) -> Iterator[Relabelling]:
 def _orders_of_images(data: _Data) -> Iterator[Relabelling]:
     """Images that come one pose late or early, against their readings."""
     q = data.detections.q
-    yield data.with_("images_before_readings", Subject(), q=np.vstack([q[:1], q[:-1]]))
-    yield data.with_("images_after_readings", Subject(), q=np.vstack([q[1:], q[-1:]]))
+    for code, moved, unread in (
+        ("images_before_readings", np.vstack([q[:1], q[:-1]]), 0),
+        ("images_after_readings", np.vstack([q[1:], q[-1:]]), len(q) - 1),
+    ):
+        yield data.with_(code, Subject(), q=moved)._replace(unread=unread)
 
 
 def _types(data: _Data) -> Iterator[Relabelling]:
@@ -240,6 +245,8 @@ def _poses(data: _Data) -> Iterator[Relabelling]:
         return
     T = d.chart.poses(in_chain_order(d.mount, d.q))
     R = Rotation.from_matrix(T[:, :3, :3])
+    # A camera on the tool sees by poses what a fixed one sees by their inverses.
+    subject = Subject(name=TOOL if d.mount == WORLD else WORLD)
     for code, other in (
         ("inverse_poses", rigid_inverse(T)),
         ("transposed_rotations", _with_rotations(T, R.inv())),
@@ -247,7 +254,7 @@ def _poses(data: _Data) -> Iterator[Relabelling]:
     ):
         there = FlangeChart.of(other)
         q = in_chain_order(d.mount, there.coordinates(other))
-        yield data.with_(code, Subject(), q=q, chart=there)
+        yield data.with_(code, subject if code == "inverse_poses" else Subject(), q=q, chart=there)
 
 
 def _with_rotations(T: FloatArray, R: Rotation) -> FloatArray:
@@ -263,7 +270,7 @@ _NEARER = dict.fromkeys(_SHIFTED, (_Data.dated,)) | {"tracker_memory": (_Data.sh
 SIMPLE = (_mounts, _orders_of_images, _types, _stationary)
 OTHERS = (_exchanged, _couplings, _parallelograms, _units, _sizes, _images_shifted_from, _memories)
 # Those of poses of the flange, which are no joints.
-OF_POSES = ((_mounts, _orders_of_images, _poses), (_sizes, _images_shifted_from, _memories))
+OF_POSES = ((_orders_of_images, _poses), (_sizes, _images_shifted_from, _memories))
 
 
 def relabelled(
@@ -319,6 +326,9 @@ def _best(data: _Data, search: Search, max_px: float, tried: Sequence[Relabellin
                 found = fit_from(one.problem, found.params, search.epipolar)
         if found is None or found.sigma_px > max_px or found.used.sum() < _KEPT * one.detections.seen.sum():
             continue
-        if unexplained(found, Outliers.empty(one.detections), search.epipolar) is None:
+        out = Outliers.empty(one.detections)
+        if one.unread is not None:
+            out.explained[:, one.detections.pose_of == one.unread] = True
+        if unexplained(found, out, search.epipolar) is None:
             return one._replace(noise_px=found.sigma_px)
     return None
