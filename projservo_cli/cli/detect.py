@@ -10,7 +10,12 @@ from projservo_cli.cli.output import Console
 from projservo_cli.cli.program import main
 
 if TYPE_CHECKING:
+    from projservo_cli.detection.episodes import Episodes
+    from projservo_cli.detection.finders import Finder
     from projservo_cli.detection.images import ImageSeries
+
+# Poses at which a marker is seen, below which it says little: calibrate judges markers from eight poses on.
+_SELDOM = 8
 
 
 @main.command(
@@ -23,6 +28,26 @@ if TYPE_CHECKING:
     metavar="CSV",
     type=click.Path(),
     help="Readings, a row per pose: q1 ... qN or a pose of the flange, perhaps pose or left, right.",
+)
+@click.option("--lerobot", metavar="FOLDER", type=option.PATH, help="Episodes of a LeRobot data set instead.")
+@click.option("--episodes", metavar="LIST", help="With --lerobot: such as 0-3,7; by default all.")
+@click.option(
+    "--state-unit",
+    type=click.Choice(["deg", "rad", "normalised"]),
+    help="With --lerobot: of the joints, if the data set does not say it; normalised is -100 to 100.",
+)
+@click.option(
+    "--calibration-file",
+    metavar="JSON",
+    type=option.PATH,
+    help="With --lerobot: LeRobot's calibration of the arm, for normalised joints.",
+)
+@click.option(
+    "--mount",
+    type=click.Choice(["world", "tool"]),
+    default="world",
+    show_default=True,
+    help="With --lerobot: where the cameras are; tags are then on the tool or in the scene.",
 )
 @click.option(
     "--bag",
@@ -82,6 +107,11 @@ def _detect(
     readings_topic: str | None,
     frames: tuple[str, str] | None,
     joint_names: str,
+    lerobot: Path | None,
+    episodes: str | None,
+    state_unit: str | None,
+    calibration_file: Path | None,
+    mount: str,
     dictionary: str,
     board: str | None,
     points: str,
@@ -109,6 +139,11 @@ def _detect(
     A bag of ROS 1 or 2 (--bag) brings images and readings along. The poses are the stops of the robot, each
     with one image of each camera; images in motion are kept for the delay of the cameras. Needs rosbags: pip
     install '.[bags]'.
+
+    With --lerobot images and joints are those of episodes, at frames at which the arm hardly moves; joints
+    are then in rad, and grippers are left out. Cameras are all of the data set, or NAME=KEY each. If a camera
+    moved between episodes, the table has the longest stretch before or after, and TABLE_episodes_12-19.csv
+    and so on the others. Needs pip install '.[lerobot]'.
     """
     import numpy as np
 
@@ -120,6 +155,13 @@ def _detect(
     if board is not None and points == "centers":
         raise click.UsageError("--points centers: is of tags; a board has corners: leave out one of both")
     finder = finder_of(None if board is None else Board.of(board), dictionary)
+    if lerobot is not None:
+        _require_no(readings=readings, bag=bag)
+        read = _of_episodes(lerobot, episodes, images, state_unit, calibration_file)
+        _detect_episodes(console, read, finder, points, mount, output, force)
+        return
+    if episodes or state_unit or calibration_file or mount != "world":
+        raise click.UsageError("--episodes, --state-unit, --calibration-file, --mount: are of --lerobot")
     if bag is None:
         if topics or readings_topic or frames or joint_names:
             raise click.UsageError("--images, --readings-topic, --frames, --joint-names: are of a --bag")
@@ -169,7 +211,7 @@ def _of_files(
     from projservo_cli.store.observation_tables import read_joint_list
 
     if not images or readings is None:
-        raise click.UsageError("give the images and '--readings', or a '--bag'")
+        raise click.UsageError("give images and '--readings', a '--bag', or '--lerobot'")
     sources = _sources(images)
     # Readings as they are, whatever their unit.
     joints = read_joint_list(readings, joint_unit="rad", view=tuple(sources), flange=True)
@@ -210,18 +252,117 @@ def _of_bag(
     }
 
 
-def _sources(images: tuple[str, ...]) -> dict[str, str]:
-    """Folders or patterns of the images by the names of the cameras; a UsageError if these are none."""
+def _require_no(**others: object) -> None:
+    """Refuse readings from elsewhere beside those of episodes."""
+    for name, given in others.items():
+        if given is not None:
+            raise click.UsageError(f"--lerobot: has readings of its own; leave out --{name}")
+
+
+def _of_episodes(
+    folder: Path, episodes: str | None, images: tuple[str, ...], unit: str | None, calibration: Path | None
+) -> "Episodes":
+    """Frames and joints of episodes of a LeRobot data set."""
+    from projservo_cli.detection.episodes import numbers_in, read_episodes
+
+    chosen = None if episodes is None else numbers_in(episodes)
+    return read_episodes(folder, chosen, _sources(images, "KEY"), unit, calibration)
+
+
+def _detect_episodes(
+    console: Console,
+    read: "Episodes",
+    finder: "Finder",
+    points: str,
+    mount: str,
+    output: Path,
+    force: bool,
+) -> None:
+    """Find markers in frames of episodes, and cameras that moved; write a table of each stretch."""
+    import numpy as np
+
+    from projservo_cli.detection.episodes import episode_of
+    from projservo_cli.detection.observation import observe_tags
+    from projservo_cli.detection.stretches import stretches
+    from projservo_cli.store.observation_tables import write_table
+
+    observation, found = observe_tags(read.series, finder, points, console.progress)
+    still = observation.at_rest
+    episode, views = episode_of(still.pose), len(still.view)
+    parts = stretches(still, episode, mount, console.progress)
+    runs = sorted(parts.episodes, key=lambda run: -int(np.isin(episode, run).sum()))
+    tables = [output, *(output.with_stem(f"{output.stem}_episodes_{run[0]}-{run[-1]}") for run in runs[1:])]
+    for table in tables:
+        option.require_new(table, force=force)
+    for table, run in zip(tables, runs, strict=True):
+        write_table(observation.rows(np.isin(episode_of(observation.pose), run)), table, mount=mount)
+    count = np.isfinite(still.images[..., 0]).any(axis=1).sum(axis=0)
+    value = {
+        "tables": [table.resolve() for table in tables],
+        "episodes": runs,
+        "poses": len(still.pose),
+        "moving": len(observation.pose) - len(still.pose),
+        "markers": len(still.marker),
+        "joints": read.joints,
+        "unit": read.unit,
+        "frames": read.frames,
+        "slow": read.slow,
+        "left_out": read.left_out,
+        "no_slow_frame": read.empty,
+        "moved": [one._asdict() for one in parts.moved],
+        "untested": parts.untested,
+        "moved_little_deg": read.little,
+        "seldom_seen": still.marker[count < _SELDOM].tolist(),
+        "ambiguous": found.ambiguous,
+        "unrefined": found.unrefined,
+        "empty_images": found.empty,
+    }
+    pairs = [(one.last, one.first) for one in parts.moved]
+    shared = {pair for pair in pairs if pairs.count(pair) == views > 1}
+    moved = [
+        f"camera {one.view} moved by {one.by_px:.0f} px between episodes {one.last} and {one.first}"
+        for one, pair in zip(parts.moved, pairs, strict=True)
+        if pair not in shared
+    ]
+    moved += [
+        f"images of all cameras moved between episodes {last} and {first}: the cameras, tags on the tool, or "
+        "zeros of joints did"
+        for last, first in sorted(shared)
+    ]
+    words = {
+        "joints {}: " + read.unit: read.joints,
+        "left out, as they do not move the flange: {}": read.left_out,
+        "no slow frame in episodes {}": read.empty,
+        "{}": moved,
+        "whether a camera moved is not known: {}": [parts.untested] * bool(parts.untested),
+        "not shown, joints that moved little: {}": [f"{name} {x:.1f}°" for name, x in read.little.items()],
+        f"not shown, markers at fewer than {_SELDOM} poses: {{}}": value["seldom_seen"],
+    }
+    head = "detect: {poses} poses of {slow} slow frames of {frames}, {moving} in motion, {markers} markers"
+    lines = [
+        head.format_map(value),
+        *(f"  {text.format(', '.join(map(str, of)))}" for text, of in words.items() if of),
+    ]
+    for table, run in zip(tables, runs, strict=True):
+        lines.append(f"table: {table}, episodes {run[0]} to {run[-1]}")
+    console.report(value, lines)
+
+
+def _sources(images: tuple[str, ...], of: str = "IMAGES") -> dict[str, str]:
+    """Folders or patterns of the images by the names of the cameras; a UsageError if these are none.
+
+    of : what the names are of; left and right have none only if it is images.
+    """
     from projservo_cli.records import VIEWS
     from projservo_cli.settings.sections import is_view
 
     named = [image.partition("=")[::2] for image in images]
-    if len(images) == 2 and not all(is_view(name) and rest for name, rest in named):
+    if of == "IMAGES" and len(images) == 2 and not all(is_view(name) and rest for name, rest in named):
         return dict(zip(VIEWS, images, strict=True))
     for image, (name, rest) in zip(images, named, strict=True):
         if not (is_view(name) and rest):
             raise click.UsageError(
-                f"{image}: give the images of left and right, or NAME=IMAGES of each camera, such as "
+                f"{image}: give the images of left and right, or NAME={of} of each camera, such as "
                 "top=images/top: names have small letters, digits, _ and single spaces"
             )
     if len({name for name, _ in named}) < len(named):

@@ -22,6 +22,7 @@ from projservo_cli.report.figures import FIGURES
 from projservo_cli.simulation.mjcf import mujoco
 from tests.calibration.flange import write_recording
 from tests.configured import draw_only, truth_of
+from tests.detection.lerobot import make_episodes, write_dataset
 from tests.detection.rendering import render, square
 from tests.documentation.blocks import PAGES, ROOT, blocks_of, run_page
 
@@ -44,6 +45,7 @@ DRIVING = {
 LANGUAGES = {"sh", "python", "text", "xml", "yaml"}
 # What cannot be run by a test, and how often it stands there.
 NOT_RUN = {
+    "episodes": 1,
     "install": 1,
     "pick-a-part": 3,
     "refit-a-camera": 1,
@@ -124,6 +126,15 @@ def put_bag(folder):
         for t, image in frames:
             bag.image(f"/{side}/image_raw", t, image)
     bag.close()
+
+
+def put_episodes(folder):
+    """Four episodes of an arm of three joints, between which a camera moves."""
+    for package in ("cv2", "av", "pyarrow"):
+        pytest.importorskip(package, reason=f"{package} is not installed: pip install '.[lerobot]'")
+    episodes, _ = make_episodes(np.random.default_rng(5), 4, moved=2)
+    names = ["shoulder_pan.pos", "shoulder_lift.pos", "wrist_roll.pos", "gripper.pos"]
+    write_dataset(folder / "pick", "v3.0", episodes, names)
 
 
 def require_gl():
@@ -271,6 +282,7 @@ def check_paper(folder, names, read):
 HAS = {
     "bags": (put_bag,),
     "camera-on-the-hand": (put_hand,),
+    "episodes": (put_episodes,),
     "flange-poses": (put_poses,),
     "print-and-mount-tags": (put_tags,),
     "observation-tables": (put_sheet,),

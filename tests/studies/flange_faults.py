@@ -2,10 +2,11 @@
 
     python -m tests.studies.flange_faults [--seeds N] [--kinds KIND ...] [-o flange_faults.csv]
 
-Poses of the flange by tables, 25 a draw, by a fixed camera in even draws, on the flange in odd ones, of a board
-of 8×6 corners and known shape; 0.3 px. A fault is named where the table is refused, or a finding has one of its
-codes. Else the rms error of images at new poses, without the fault, is to be within twice the stated one;
-poses of the camera stay such. Prints for each kind how many are named, held, neither, and named otherwise.
+Poses of the flange by tables, 25 a draw, by a fixed camera in even draws, on the flange in odd ones, of a
+board of 8×6 corners and known shape; 0.3 px. A fault is named where the table is refused, or a finding has
+one of its codes. Else the rms error of images at new poses, without the fault, is to be within twice the
+stated one; poses of the camera stay such. Prints for each kind how many are named, held, neither, and named
+otherwise.
 """
 
 import tempfile
