@@ -181,6 +181,15 @@ def test_a_type_that_moves_keeps_its_key():
     assert encoded(named(1)) == b'{"Other":{"x":1}}'
 
 
+def test_a_key_that_is_new_counts_where_it_is_set():
+    plain, stated = (
+        calibration_inputs(configured("ur5", f"markers.boards={text}"))
+        for text in ("[]", "[{columns: 2, rows: 2}]")
+    )
+    assert b"boards" not in encoded(plain)
+    assert b"StatedBoard" in encoded(stated)
+
+
 def test_tables_and_goal_files_count_by_their_content(tmp_path):
     config = configured("ur5", "calibration.cross_validate=null")
     table = tmp_path / "trials.csv"
