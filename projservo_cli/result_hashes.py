@@ -57,7 +57,7 @@ _FIRST_MODULES = {
     "task.stand_off": "StandOff",
 }
 # Fields that records had not at first: they count where they are not as by default, so that older keys hold.
-_ADDED: dict[str, dict[str, Any]] = {"Estimation": {"boards": ()}, "Markers": {"boards": ()}}
+_ADDED: dict[str, dict[str, Any]] = {"Estimation": {"boards": ()}, "Markers": {"boards": None}}
 _KINDS = {
     name: f"projservo_cli.{module}:{name}"
     for module, names in _FIRST_MODULES.items()

@@ -157,8 +157,10 @@ class Markers(Section):
     board: BoardSettings | None = Field(
         None, description="board whose inner corners are the markers, numbered row by row as OpenCV does"
     )
-    boards: tuple[KnownBoard, ...] = Field(
-        (), max_length=100, description="boards whose corners are markers of a table; a fit uses their shape"
+    boards: tuple[KnownBoard, ...] | None = Field(
+        None,
+        max_length=100,
+        description="boards whose corners are markers of a table; a fit uses their shape",
     )
     dictionary: Text | None = Field(
         None,
@@ -188,7 +190,7 @@ class Markers(Section):
     @property
     def stated_boards(self) -> tuple[StatedBoard, ...]:
         """Boards whose shape is known, in a table or as they are detected."""
-        known = tuple(one.stated for one in self.boards)
+        known = tuple(one.stated for one in self.boards or ())
         if self.board is None:
             return known
         rows, columns = self.board.pattern.shape

@@ -184,7 +184,7 @@ def test_a_type_that_moves_keeps_its_key():
 def test_a_key_that_is_new_counts_where_it_is_set():
     plain, stated = (
         calibration_inputs(configured("ur5", f"markers.boards={text}"))
-        for text in ("[]", "[{columns: 2, rows: 2}]")
+        for text in ("null", "[{columns: 2, rows: 2}]")
     )
     assert b"boards" not in encoded(plain)
     assert b"StatedBoard" in encoded(stated)
