@@ -14,12 +14,14 @@ if TYPE_CHECKING:
     from projservo_cli.experiment import Experiment
     from projservo_cli.observations import Observations
     from projservo_cli.records import InputError, WorkFailed
+    from projservo_cli.robots.flange_robot import PoseRefused
 
 _PLACES = {
     "Config": "config",
     "Experiment": "experiment",
     "InputError": "records",
     "Observations": "observations",
+    "PoseRefused": "robots.flange_robot",
     "WorkFailed": "records",
     **dict.fromkeys(("calibrate", "load", "plan", "record", "servo", "simulate", "sweep"), "api"),
 }
@@ -29,6 +31,7 @@ __all__ = [
     "Experiment",
     "InputError",
     "Observations",
+    "PoseRefused",
     "WorkFailed",
     "__version__",
     "calibrate",

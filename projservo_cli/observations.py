@@ -10,12 +10,11 @@ import numpy as np
 import numpy.typing as npt
 
 from projservo_cli.calibration.detections import require_size_and_noise
-from projservo_cli.geometry.flange import FLANGE_TYPES, FlangeChart
+from projservo_cli.geometry.flange import FLANGE_TYPES, FlangeChart, require_poses
 from projservo_cli.image_size import ImageSize
 from projservo_cli.records import TOOL, VIEWS, WORLD, InputError, Observation
 from projservo_cli.settings.sections import is_view
 from projservo_cli.store.display import Displayable, checked_array, numbers_in, pandas
-from projservo_cli.store.flange_poses import require_poses
 from projservo_cli.store.observation_tables import (
     in_radians,
     mount_in,

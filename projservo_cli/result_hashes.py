@@ -57,7 +57,11 @@ _FIRST_MODULES = {
     "task.stand_off": "StandOff",
 }
 # Fields that records had not at first: they count where they are not as by default, so that older keys hold.
-_ADDED: dict[str, dict[str, Any]] = {"Estimation": {"boards": ()}, "Markers": {"boards": None}}
+_ADDED: dict[str, dict[str, Any]] = {
+    "Estimation": {"boards": ()},
+    "Markers": {"boards": None},
+    **{name: {"flange_chart": None} for name in ("JointSettings", "OwnRobot", "Table")},
+}
 _KINDS = {
     name: f"projservo_cli.{module}:{name}"
     for module, names in _FIRST_MODULES.items()
@@ -125,7 +129,11 @@ def _canonical(value: Any) -> Any:
     if (fields := _fields(value)) or hasattr(type(value), "model_fields"):
         name = type(value).__qualname__
         added = _ADDED.get(name, {})
-        fields = {key: inner for key, inner in fields.items() if key not in added or inner != added[key]}
+        fields = {
+            key: inner
+            for key, inner in fields.items()
+            if key not in added or (isinstance(inner, np.ndarray) or inner != added[key])
+        }
         return {_KINDS.get(name, name): {key: _canonical(inner) for key, inner in fields.items()}}
     if isinstance(value, dict):
         return {"mapping": {key: _canonical(value[key]) for key in sorted(value)}}

@@ -14,7 +14,7 @@ import numpy as np
 
 from projservo_cli.config.loading import Config, stored_yaml
 from projservo_cli.config.settings_and_rules import carriers_of, truth_of
-from projservo_cli.records import ANGLE, MEET, PARALLEL, PERPENDICULAR, TOOL, InputError
+from projservo_cli.records import ANGLE, MEET, MM, PARALLEL, PERPENDICULAR, TOOL, FloatArray, InputError
 from projservo_cli.result_hashes import File
 from projservo_cli.settings.control import LawSettings, SpeedLimits
 from projservo_cli.settings.disturbance import Disturbance, Events, Faults
@@ -81,7 +81,9 @@ def calibration_inputs(config: Config, files: Files | None = None) -> Calibratio
         table, readings = _file("table", data.table, files), _file_if("readings", data.readings, files)
         kind, stated = (config.joint_types, data.joint_unit), data.joint_order == "stated"
         mount = data.mount or (None if config.rig is None else config.rig.mount)
-        source = Table(table, readings, *kind, size, data.noise_px, _seed(config), mount, stated)
+        source = Table(
+            table, readings, *kind, size, data.noise_px, _seed(config), mount, stated, _flange_chart(config)
+        )
     else:
         # A factor of commands to a robot that may do harm; simulated trials do not depend on it.
         at_full_speed = {"plant": config.plant.model_copy(update={"speed_scale": 1.0})}
@@ -444,8 +446,24 @@ def joints_of(config: Config, *, paced: bool = True) -> JointSettings:
         limits=limits,
         unit=(limits.unit if limits is not None else None) or ("rad" if vector is None else vector.unit),
         known=0 if vector is None else len(vector.joints),
-        speeds=config.control.speed_limits if paced else SpeedLimits(),
+        speeds=_speeds(config) if paced else SpeedLimits(),
+        flange_chart=_flange_chart(config),
     )
+
+
+def _flange_chart(config: Config) -> FloatArray | None:
+    """Chart (2, 4, 4) of readings that are poses of the flange; None for joints."""
+    flange = None if config.robot is None else config.robot.flange
+    return None if flange is None else flange.chart.record
+
+
+def _speeds(config: Config) -> SpeedLimits:
+    """Speed limits of the joints, or those of poses of the flange, unless the control sets lower ones."""
+    limits, flange = config.control.speed_limits, None if config.robot is None else config.robot.flange
+    if flange is None:
+        return limits
+    slide, turn = flange.max_speed_mm_s / MM, math.radians(flange.max_turn_deg_s)
+    return limits._replace(revolute=min(limits.revolute, turn), prismatic=min(limits.prismatic, slide))
 
 
 def _drive(config: Config, truth: Truth | None, files: Files | None = None, *, shows: bool = False) -> Drive:
@@ -475,6 +493,7 @@ def _own(config: Config) -> OwnRobot:
         image_size=config.image_size_px,
         cameras=config.cameras,
         board=markers.pattern,
+        flange_chart=_flange_chart(config),
     )
 
 

@@ -5,6 +5,7 @@ three of its axes through the origin of the flange there: a chain PPPRRR whose o
 base, m. The map of poses to coordinates is exact; only where the middle turn is 90° do coordinates jump.
 """
 
+from collections.abc import Sequence
 from functools import reduce
 from typing import NamedTuple
 
@@ -12,12 +13,14 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from projservo_cli.geometry.displacements import displacements, twists
-from projservo_cli.records import FloatArray, prismatic_of
+from projservo_cli.records import FARTHEST_M, FloatArray, InputError, prismatic_of
 
 # Types of the coordinates of a pose.
 FLANGE_TYPES = "PPPRRR"
 # Singular value of the rates of turns below which the middle one is taken to be 90°.
 _LOCKED = 1e-6
+# Maximum difference of RᵀR from the identity.
+_ORTHOGONAL = 1e-3
 
 
 class FlangeChart(NamedTuple):
@@ -70,6 +73,12 @@ class FlangeChart(NamedTuple):
         moved = displacements(self.H_hat, prismatic_of(FLANGE_TYPES), q)
         return np.asarray(reduce(np.matmul, moved) @ self.T)
 
+    def turn_axes(self, q: FloatArray) -> FloatArray:
+        """Axes (3, 3) in the base, a column each, of the turns at coordinates (6,)."""
+        a, b = (Rotation.from_rotvec(q[3 + i] * np.eye(3)[i]) for i in range(2))
+        columns = [1.0, 0.0, 0.0], a.apply([0.0, 1.0, 0.0]), (a * b).apply([0.0, 0.0, 1.0])
+        return np.asarray(self.axes @ np.column_stack(columns))
+
     def by_twist(self, q: FloatArray) -> FloatArray:
         """Derivatives (K, 6, 6) of coordinates (K, 6) by a twist of the flange, its translation first."""
         a, b, c = (Rotation.from_rotvec(q[:, [3 + i]] * np.eye(3)[i]) for i in range(3))
@@ -83,3 +92,28 @@ class FlangeChart(NamedTuple):
         result[:, :3, :3] = self.axes @ (a * b * c).as_matrix() @ to_turns
         result[:, 3:, 3:] = np.linalg.pinv(np.stack(columns, axis=-1), rcond=_LOCKED) @ to_turns
         return result
+
+
+def require_poses(T: FloatArray, where: Sequence[str]) -> None:
+    """Refuse matrices (K, 4, 4) that are no poses in m, with an InputError; ``where`` names each."""
+    for k in np.flatnonzero(~np.isfinite(T).all(axis=(1, 2)))[:1]:
+        raise InputError(f"{where[k]}: holds a number that is not finite; leave such poses out")
+    _require_rotations(T[:, :3, :3], where)
+    far = np.abs(T[:, :3, 3]).max(axis=1)
+    if far[k := int(np.argmax(far))] > FARTHEST_M:
+        raise InputError(
+            f"{where[k]}: a position of {far[k]:g} m looks like millimetres: name the columns x_mm, y_mm, "
+            "z_mm, or divide by 1000"
+        )
+
+
+def _require_rotations(R: FloatArray, where: Sequence[str]) -> None:
+    """Refuse matrices (K, 3, 3) that are no rotations."""
+    off = np.abs(R.swapaxes(1, 2) @ R - np.eye(3)).max(axis=(1, 2))
+    for k in np.flatnonzero((off > _ORTHOGONAL) | (np.linalg.det(R) < 0.0))[:1]:
+        mirrored = off[k] <= _ORTHOGONAL
+        why = "mirrors" if mirrored else f"is not orthogonal, by {off[k]:.2g} ({_ORTHOGONAL:g} at most)"
+        raise InputError(
+            f"{where[k]}: the rotation of T11 … T33 {why}: give the 3×4 matrix row by row, T11, T12, T13, "
+            "T14, T21, …"
+        )

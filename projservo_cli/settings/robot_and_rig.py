@@ -7,7 +7,9 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from projservo_cli.records import TWO_TURNS
+from projservo_cli.geometry.displacements import screws
+from projservo_cli.geometry.flange import FLANGE_TYPES, FlangeChart
+from projservo_cli.records import MM, TWO_TURNS
 from projservo_cli.settings.sections import (
     ByView,
     JointVector,
@@ -119,6 +121,59 @@ class _Screws(Section):
         yield from self.reference.miscounted("".join(joint.type for joint in self.joints), "reference")
 
 
+class FlangeSettings(Section):
+    """A controller that takes poses of the flange in the base, p_base = T p_flange, instead of joints.
+
+    Readings are the shift from home along the axes of the base, m, then turns about its x, y and z through
+    the flange.
+    """
+
+    home: Pose = Field(description="pose of the flange from which readings count, m: its middle, if any")
+    box_mm: tuple[Limits, Limits, Limits] = Field(
+        description="minimum and maximum x, y, z of the flange in the base"
+    )
+    max_tilt_deg: Annotated[Positive, Field(le=80.0)] = Field(
+        45.0, description="maximum turn about x and about y of the base, from home"
+    )
+    max_spin_deg: Annotated[Positive, Field(le=180.0)] = Field(
+        180.0, description="maximum turn about z, from home"
+    )
+    max_speed_mm_s: Positive = Field(100.0, description="maximum speed along each axis")
+    max_turn_deg_s: Positive = Field(30.0, description="maximum speed of each turn")
+
+    @property
+    def chart(self) -> FlangeChart:
+        """Chart of its readings."""
+        return FlangeChart(np.eye(3), np.array(self.home))
+
+    @property
+    def screws(self) -> _Screws:
+        """Its readings as joints of an arm."""
+        place = np.array(self.home)[:3, 3]
+        slides = ((np.array(self.box_mm) / MM - place[:, None]) + 0.0).tolist()
+        turns = [[-turn, turn] for turn in (self.max_tilt_deg, self.max_tilt_deg, self.max_spin_deg)]
+        joints = [
+            {"type": kind, "name": name, "w": w.tolist(), "v": v.tolist(), unit: limits}
+            for kind, name, (w, v), unit, limits in zip(
+                FLANGE_TYPES,
+                ("x", "y", "z", "turn about x", "turn about y", "turn about z"),
+                screws(self.chart.H_hat).reshape(6, 2, 3),
+                ["limits_m"] * 3 + ["limits_deg"] * 3,
+                slides + turns,
+                strict=True,
+            )
+        ]
+        reference = {"joints": [0.0] * 6, "unit": "rad"}
+        return _Screws.model_validate({"reference": reference, "base_tool": self.home, "joints": joints})
+
+    def contradictions(self) -> Iterator[Note]:
+        """A home outside the box."""
+        for i, (low, high) in enumerate(self.box_mm):
+            if not low < MM * self.home[i][3] < high:
+                at = f"home has {'xyz'[i]} {MM * self.home[i][3]:g} mm"
+                yield ("box_mm",), f"{at}, which is not between {low:g} and {high:g}"
+
+
 class LimitSettings(OneOf):
     """Joint limits of a robot without kinematics in the configuration."""
 
@@ -162,14 +217,22 @@ class RobotSettings(Section):
         None, description="path of a MuJoCo model, which the plant mujoco simulates and renders"
     )
     urdf: Text | None = Field(None, description="path of a URDF, of which only the screws are read")
+    flange: FlangeSettings | None = Field(
+        None, description="limits of a controller that takes poses of the flange instead of joints"
+    )
     tip: str | None = Field(None, description="body or site of mjcf, or link of urdf, that carries the tool")
     limits: LimitSettings | None = Field(None, description="joint limits of a robot without dh and screws")
 
     @property
     def joints(self) -> tuple[_Joint, ...]:
         """The joints from base to tool."""
-        kinematics = self.dh or self.screws
+        kinematics = self.dh or self.twists
         return kinematics.joints if kinematics is not None else ()
+
+    @property
+    def twists(self) -> _Screws | None:
+        """Joint screws, as given or of poses of the flange."""
+        return self.screws if self.flange is None else self.flange.screws
 
     @property
     def joint_types(self) -> str:
@@ -184,8 +247,8 @@ class RobotSettings(Section):
     def contradictions(self) -> Iterator[Note]:
         """Yield missing or several descriptions of joints and limits; a file without a tip."""
         screws = None if self.mjcf is not None else self.screws  # screws of the file
-        if (self.dh, screws, self.mjcf, self.urdf, self.limits).count(None) != 4:
-            yield (), "give exactly one of dh, screws, mjcf, urdf and, for an external robot, limits"
+        if (self.dh, screws, self.mjcf, self.urdf, self.limits, self.flange).count(None) != 5:
+            yield (), "give exactly one of dh, screws, mjcf, urdf, flange and, for an external robot, limits"
         if (self.tip is None) != (self.mjcf is None and self.urdf is None):
             yield ("tip",), "names the body of mjcf, or the link of urdf, that holds the tool: give both"
 

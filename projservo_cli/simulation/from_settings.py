@@ -30,8 +30,7 @@ def arm_of(robot: RobotSettings) -> SerialArm:
     kinds = robot.joint_types
     prismatic = prismatic_of(kinds)
     limits = position_limits(*np.array(robot.ranges, dtype=np.float64).T.copy())
-    if robot.screws is not None:
-        screws = robot.screws
+    if (screws := robot.twists) is not None:
         H_hat = twists(np.array([[*joint.w, *joint.v] for joint in screws.joints], dtype=np.float64))
         q_reference = screws.reference.values(kinds)
         return SerialArm(H_hat, prismatic, q_reference, np.array(screws.base_tool), limits)

@@ -91,11 +91,11 @@ def _refitted(inputs: RefitInputs, before: _Calibrated) -> _Calibrated:
 
 def recorded(table: Table) -> Observations:
     """Return the observations of a table."""
-    unit = table.joint_types, table.joint_unit
+    unit, chart = (table.joint_types, table.joint_unit), table.flange_chart
     return Observations.of(
-        read_table(table.file.path, *unit)
+        read_table(table.file.path, *unit, chart=chart)
         if table.readings is None
-        else read_detections(table.file.path, table.readings.path, *unit),
+        else read_detections(table.file.path, table.readings.path, *unit, chart=chart),
         joint_types=table.joint_types,
         image_size=table.image_size,
         noise_px=table.noise_px,
@@ -110,6 +110,7 @@ def simulated(
 ) -> Observations:
     """Simulate the trial motions, or poses (K, n), rad or m; the observations."""
     observation, noise_px = observed(trials, q, seed, progress=progress)
+    observation = replace(observation, flange_chart=trials.joints.flange_chart)
     assert trials.truth is not None
     truth, ideal = trials.truth, trials.driven is None
     normal, straight = truth.noise == NORMAL, not truth.lens[:, K1:].any()

@@ -24,7 +24,9 @@ def in_metres(calibration: Calibration, known: KnownLengths) -> tuple[Metric | N
     apart = np.nan_to_num(known.apart[np.ix_(at, at)], nan=0.0)
     length_m: float | None = None
     between: Scale = "joint"
-    if known.tag_size_m is not None:
+    if calibration.flange_chart is not None:
+        pass  # its poses are in metres
+    elif known.tag_size_m is not None:
         length_m, between = known.tag_size_m, "tags"
     elif apart.any():
         i, j = np.unravel_index(int(np.argmax(apart)), apart.shape)

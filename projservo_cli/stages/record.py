@@ -67,6 +67,7 @@ class _Recording:
     identity: str = ""  # identity of the robot that recorded them
     view: tuple[str, ...] = VIEWS  # names of its views
     mount: str = WORLD  # mount of its cameras
+    flange_chart: FloatArray | None = None  # (2, 4, 4) of readings that are poses of the flange
     why: str = "none yet"  # why there is something to record; empty if there is nothing
     commands: int = 0  # steps sent to the robot
     # Sum of the squares of deviations of pixels of one pose from their mean, px², and its degrees of freedom.
@@ -147,6 +148,7 @@ class _Recording:
             t_q=np.array([reading.t_q for reading in rows]) if timed else None,
             t_view=np.array([reading.t_view for reading in rows]) if timed else None,
             sigma=np.array(sigma) if len(sigma) == len(rows) else None,
+            flange_chart=self.flange_chart,
         )
 
 
@@ -241,6 +243,7 @@ def new_recording(
         targets = np.vstack([targets, motions.q])
     numbers = np.array(inputs.numbers, dtype=np.int64)
     recording = _Recording(path or Path(), key, targets, numbers, mount=inputs.mount)
+    recording = replace(recording, flange_chart=inputs.trials.joints.flange_chart)
     if path is None:
         return recording
     if path.exists() and force:
@@ -263,7 +266,9 @@ def _resumed(empty: _Recording, maximum: FloatArray) -> _Recording:
     if recording_of(path) != recording.key:
         raise _OutdatedError(f"{path}: was not recorded with this configuration; {remedy}")
     n = recording.targets.shape[1]
-    table = read_table(path, "R" * n, "rad")
+    chart = recording.flange_chart
+    known = ("R" * n, "rad") if chart is None else ()
+    table = read_table(path, *known, chart=chart)
     if sorted(recording.marker) != table.marker.tolist():
         raise _OutdatedError(f"{path}: has other markers than the configuration; {remedy}")
     column = np.searchsorted(table.marker, recording.marker)

@@ -41,6 +41,7 @@ class JointSettings(NamedTuple):
     unit: str  # unit of the given readings of revolute joints, deg or rad
     known: int  # number of joints with given readings
     speeds: SpeedLimits = SpeedLimits()
+    flange_chart: FloatArray | None = None  # (2, 4, 4) of readings that are poses of the flange
 
     def joints(self, default_types: str = "", calibration: Calibration | None = None) -> Joints:
         """Joints of the robot; of ``default_types``, otherwise revolute ones, if their types are unknown.
@@ -99,6 +100,7 @@ class OwnRobot(NamedTuple):
     image_size: ImageSize | None  # width and height of its images, px, if known
     cameras: Cameras | None = None  # cameras of an arm that reads joints alone
     board: Board | None = None  # whose corners these show; None for tags
+    flange_chart: FloatArray | None = None  # (2, 4, 4) of poses that it takes and reads; None for joints
 
 
 class Drive(NamedTuple):
@@ -180,6 +182,9 @@ class Table(NamedTuple):
     seed: int  # seed of random starts
     mount: str | None  # mount of the cameras, world or tool; None as the table states
     order_stated: bool  # whether the user stated the order of the joints
+    flange_chart: FloatArray | None = (
+        None  # (2, 4, 4) in which poses of the flange are read; None for their own
+    )
 
 
 @dataclass(frozen=True)

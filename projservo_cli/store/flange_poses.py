@@ -11,15 +11,15 @@ from itertools import product
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from projservo_cli.geometry.flange import FlangeChart
-from projservo_cli.records import FARTHEST_M, Calibration, FloatArray, InputError
+from projservo_cli.geometry.flange import FlangeChart, require_poses
+from projservo_cli.records import Calibration, FloatArray, InputError
 
 _METRES, _MILLIMETRES = ("x", "y", "z"), ("x_mm", "y_mm", "z_mm")
 _QUATERNION, _VECTOR = ("qx", "qy", "qz", "qw"), ("rx", "ry", "rz")
 _MATRIX = tuple(f"t{i}{j}" for i, j in product(range(1, 4), range(1, 5)))
 _FORMS = (*product((_METRES, _MILLIMETRES), (_QUATERNION, _VECTOR)), (_MATRIX, ()))
-# Maximum difference of the length of a quaternion from one, and of RᵀR from the identity.
-_UNIT, _ORTHOGONAL = 0.01, 1e-3
+# Maximum difference of the length of a quaternion from one.
+_UNIT = 0.01
 FORMS = "x, y, z (m) or x_mm, y_mm, z_mm with qx, qy, qz, qw or rx, ry, rz (rad); or T11 … T34 (m)"
 
 
@@ -55,31 +55,6 @@ def poses_of(columns: Sequence[str], values: FloatArray, where: Sequence[str]) -
     return T
 
 
-def require_poses(T: FloatArray, where: Sequence[str]) -> None:
-    """Refuse matrices (K, 4, 4) that are no poses in m, with an InputError; ``where`` names each."""
-    for k in np.flatnonzero(~np.isfinite(T).all(axis=(1, 2)))[:1]:
-        raise InputError(f"{where[k]}: holds a number that is not finite; leave such poses out")
-    _require_rotations(T[:, :3, :3], where)
-    far = np.abs(T[:, :3, 3]).max(axis=1)
-    if far[k := int(np.argmax(far))] > FARTHEST_M:
-        raise InputError(
-            f"{where[k]}: a position of {far[k]:g} m looks like millimetres: name the columns x_mm, y_mm, "
-            "z_mm, or divide by 1000"
-        )
-
-
-def _require_rotations(R: FloatArray, where: Sequence[str]) -> None:
-    """Refuse matrices (K, 3, 3) that are no rotations."""
-    off = np.abs(R.swapaxes(1, 2) @ R - np.eye(3)).max(axis=(1, 2))
-    for k in np.flatnonzero((off > _ORTHOGONAL) | (np.linalg.det(R) < 0.0))[:1]:
-        mirrored = off[k] <= _ORTHOGONAL
-        why = "mirrors" if mirrored else f"is not orthogonal, by {off[k]:.2g} ({_ORTHOGONAL:g} at most)"
-        raise InputError(
-            f"{where[k]}: the rotation of T11 … T33 {why}: give the 3×4 matrix row by row, T11, T12, T13, "
-            "T14, T21, …"
-        )
-
-
 def _require_quaternions(turns: FloatArray, where: Sequence[str]) -> None:
     """Refuse quaternions (K, 4) that are not of unit length."""
     length = np.linalg.norm(turns, axis=1)
@@ -99,12 +74,15 @@ def _require_vectors(turns: FloatArray, where: Sequence[str]) -> None:
         )
 
 
-def coordinates_of(T: FloatArray, where: str, like: Calibration | None) -> tuple[FloatArray, FloatArray]:
-    """Coordinates (K, 6) of poses (K, 4, 4), and their chart (2, 4, 4): that of a calibration, if given.
+def coordinates_of(
+    T: FloatArray, where: str, like: Calibration | None, given: FloatArray | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """Coordinates (K, 6) of poses (K, 4, 4), and their chart (2, 4, 4): of a calibration, or as given.
 
     Raises InputError where the calibration is by joints.
     """
-    chart = FlangeChart.of(T) if like is None else FlangeChart.from_optional(like.flange_chart)
+    own = given if like is None else like.flange_chart
+    chart = FlangeChart.of(T) if like is None and given is None else FlangeChart.from_optional(own)
     if chart is None:
         raise InputError(
             f"{where}: these rows are poses of the flange, and the calibration is by joint readings: give "

@@ -77,6 +77,7 @@ def read_table(
     *,
     frame: str | None = None,
     like: Calibration | None = None,
+    chart: FloatArray | None = None,
 ) -> Observation:
     """Read an observation table, by joint readings or by poses of the flange.
 
@@ -86,6 +87,7 @@ def read_table(
     joint_unit : unit of the revolute columns, ``deg`` or ``rad``; by default rad, and readings beyond two
         turns are refused as a mistaken unit.
     like : calibration whose readings these must be like, poses of the flange in the same coordinates.
+    chart : (2, 4, 4) coordinates of poses of the flange without one; None for some about them.
     Returns poses in the order of their first row, markers by number; NaN if unseen; readings in rad and m.
     Raises InputError ``file:line: message`` if the file cannot be read or a row is not valid.
     """
@@ -132,12 +134,14 @@ def read_table(
         np.array([[of_pose.get(name) for name in names] for of_pose in values], dtype=np.float64)
         for names in (sheet.joints, (_MOVING,), times_of)
     )
-    q, chart = sheet.readings(numbers, q_read, joint_unit, [line for line, _ in readings.values()], like)
+    q, flange_chart = sheet.readings(
+        numbers, q_read, joint_unit, [line for line, _ in readings.values()], like, chart
+    )
     found = Observation(
         pose=numbers,
         marker=markers,
         q=q,
-        flange_chart=chart,
+        flange_chart=flange_chart,
         images=images,
         view=sheet.views,
         moving=moving[:, 0].astype(np.int64) if np.nansum(moving) > 0.0 else None,
@@ -156,17 +160,18 @@ def read_detections(
     joint_unit: str | None = None,
     *,
     like: Calibration | None = None,
+    chart: FloatArray | None = None,
 ) -> Observation:
     """Read a list of detections of any cameras, ``pose, camera, marker, u, v``, beside a table of readings.
 
     Optional columns: ``sigma``, px, and ``t``, s, the time of an image. Views are the cameras: left, right,
     then all others by name, c2 before c10; one whose name is a number n is cam n. Poses of the table of
     joints that no row names are poses that no camera saw.
-    readings : table of joints, ``pose, q1 … qN``, or of poses of the flange; joint_types, joint_unit, like :
-        as for an observation table.
+    readings : table of joints, ``pose, q1 … qN``, or of poses of the flange; joint_types, joint_unit, like,
+        chart : as for an observation table.
     Raises InputError ``file:line: message`` if a file cannot be read or a row is not valid.
     """
-    joints = read_joint_list(readings, joint_types, joint_unit, flange=True, like=like)
+    joints = read_joint_list(readings, joint_types, joint_unit, flange=True, like=like, chart=chart)
     sheet = _Sheet(path, _DETECTION, optional=["sigma", "t"], joints=False)
     poses = {int(pose): k for k, pose in enumerate(joints.pose)}
     views: dict[str, int] = {}
@@ -228,13 +233,14 @@ def read_joint_list(
     *,
     flange: bool = False,
     like: Calibration | None = None,
+    chart: FloatArray | None = None,
 ) -> JointList:
     """Read a list of joint readings, one pose per row: columns ``q1 … qN``, optionally ``pose, left, right``.
 
     view : names of the views, which columns with names of their images have; by default left and right.
     joint_types : as for an observation table.
     joint_unit : ``deg`` or ``rad`` as for an observation table; with ``rad`` readings stay as they are.
-    flange : whether poses of the flange may stand for them; like : as for an observation table.
+    flange : whether poses of the flange may stand for them; like, chart : as for an observation table.
     Raises InputError ``file:line: message`` if the file cannot be read or a row is not valid.
     """
     sheet = _Sheet(path, [], joint_types, optional=["pose", *view], unread=view, flange=flange)
@@ -254,10 +260,10 @@ def read_joint_list(
             )
     sheet.require(readings, "a pose")
     poses = np.array([*lines], dtype=np.int64)
-    q, chart = sheet.readings(poses, np.array(readings), joint_unit, [*lines.values()], like)
+    q, flange_chart = sheet.readings(poses, np.array(readings), joint_unit, [*lines.values()], like, chart)
     images = dict(zip(view, zip(*names, strict=True), strict=True)) if named else None
     numbered = "pose" in sheet.columns
-    return JointList(pose=poses, q=q, numbered=numbered, images=images, flange_chart=chart)
+    return JointList(pose=poses, q=q, numbered=numbered, images=images, flange_chart=flange_chart)
 
 
 def read_positions(path: Path | str, joint_types: str, joint_unit: str | None = None) -> Positions:
@@ -309,7 +315,7 @@ def mount_in(path: Path | str, frame: str | None = None) -> str:
 
 def _recording(path: Path | str) -> str | None:
     """Return the common recording of all rows of a table; None for none or several."""
-    sheet = _Sheet(path, [], optional=[_RECORDING])
+    sheet = _Sheet(path, [], optional=[_RECORDING], joints=False)
     found = {row[_RECORDING] for row in sheet.rows() if _RECORDING in row}
     return found.pop() if len(found) == 1 else None
 
@@ -630,16 +636,17 @@ class _Sheet:
         unit: str | None,
         lines: Sequence[int],
         like: Calibration | None,
+        chart: FloatArray | None,
     ) -> tuple[FloatArray, FloatArray | None]:
         """Joint readings (K, n), rad and m, or coordinates of poses of the flange, and the chart of these.
 
-        lines : (K,) of the rows; like : calibration whose readings these must be like.
+        lines : (K,) of the rows; like : calibration whose readings these must be like; chart : otherwise.
         """
         if not self.flange:
             require_joints(self.file, like)
             return self.in_radians(pose, values, unit), None
         where = [self._place(line) for line in lines]
-        return coordinates_of(poses_of(self.flange, values, where), self.file, like)
+        return coordinates_of(poses_of(self.flange, values, where), self.file, like, chart)
 
     def in_radians(self, pose: IntArray, q: FloatArray, unit: str | None) -> FloatArray:
         """Convert readings (K, n) to rad and m, as ``in_radians``."""

@@ -7,6 +7,7 @@ import numpy as np
 
 from projservo_cli.config import load_config
 from projservo_cli.config.inputs import objects_of
+from projservo_cli.robots.flange_robot import PoseRefused
 from tests.configured import truth_of
 
 CALLS = []
@@ -46,6 +47,34 @@ class Sound:
 
     def close(self):
         CALLS.append("close")
+
+
+class ByPoses(Sound):
+    """The controller of configs/cartesian.yaml, which takes poses, and refuses those beyond a height, m."""
+
+    readings = "flange"
+
+    def __init__(self, config, lowest=0.0):
+        super().__init__(config)
+        self.chart, self.lowest = load_config(config).robot.flange.chart, lowest
+        self.q = np.zeros(6)
+
+    def read(self):
+        q, s = super().read()
+        return self.chart.poses(q[None])[0], s
+
+    def command(self, target, speed, due):
+        CALLS.append(
+            Sent(target.copy(), speed.copy(), due, target @ np.linalg.inv(self.pose), due - self.time)
+        )
+        if target[2, 3] < self.lowest:
+            raise PoseRefused("joint 3 would pass its limit")
+        self.q, self.time = self.chart.coordinates(target[None])[0], due
+
+    @property
+    def pose(self):
+        """Pose of the flange where it is."""
+        return self.chart.poses(self.q[None])[0]
 
 
 class Telling(Sound):

@@ -26,6 +26,7 @@ from projservo_cli.records import (
     InputError,
     Model,
     WorkFailed,
+    coordinate_names,
 )
 from projservo_cli.robots.contract import Reading, Robot
 from projservo_cli.robots.joint_limits import Joints
@@ -87,7 +88,8 @@ class CalibratedWorld:
     @property
     def setup(self) -> Setup:
         """Arm and cameras for words."""
-        return Setup(self.calibration.mount, self.view, len(self.joints.units))
+        names = coordinate_names(self.calibration.flange_chart)
+        return Setup(self.calibration.mount, self.view, len(self.joints.units), names)
 
     @cached_property
     def model(self) -> Model:
@@ -254,6 +256,12 @@ class CalibratedWorld:
 
     def require_ready(self) -> None:
         """Refuse to drive a robot with a calibration that cannot predict its motion."""
+        own, taken = self.inputs.joints.flange_chart, self.calibration.flange_chart
+        if (own is None) != (taken is None) or (own is not None and not np.array_equal(own, taken)):
+            raise InputError(
+                "the calibration is by other readings than those of this robot (robot.flange and its home): "
+                "calibrate with this configuration"
+            )
         if not self.calibration.usable:
             raise WorkFailed("the calibration is not usable, and no robot is driven with it: calibrate again")
         if order := order_advice(self.calibration):

@@ -12,6 +12,7 @@ from projservo_cli.hardware.camera_robot import Arm, CameraRobot
 from projservo_cli.passwords import MASK
 from projservo_cli.records import FloatArray, InputError, WorkFailed
 from projservo_cli.robots.contract import Bounds, PluginRobot, Reading, Robot
+from projservo_cli.robots.flange_robot import by_joints
 from projservo_cli.robots.joint_limits import Joints
 from projservo_cli.robots.pacing import Steered
 from projservo_cli.robots.session import Session
@@ -45,11 +46,11 @@ def plugin_robot(
             raise InputError(
                 f"plant {own.target}: a robot that is not simulated needs a limit: set control.{key}"
             )
-    robot, name, timeout_s = (
-        _made(own, (*numbers, *further), bounds, whole=view is None) if given is None else given,
-        f"plant {plugins.short_name(own.target)}",
-        own.timeout_s,
-    )
+    name, timeout_s = f"plant {plugins.short_name(own.target)}", own.timeout_s
+    if given is None:
+        robot = _made(own, (*numbers, *further), bounds, whole=view is None)
+    else:
+        robot = by_joints(given, name, own.flange_chart)
     if own.cameras is not None:  # a reading waits for a camera that reconnects
         timeout_s += own.cameras.reconnect_s
     waits, size = (timeout_s, own.open_s), own.image_size
@@ -82,6 +83,7 @@ def _made(own: OwnRobot, numbers: Sequence[int], bounds: Bounds, *, whole: bool)
                 f"plant {own.target}: has read(), which brings pixels, and cameras are configured as well: "
                 "write joints() in its place, or leave cameras out"
             )
+        arm = by_joints(arm, f"plant {own.target}", own.flange_chart)
         finder = finder_of(own.board, own.dictionary)
         return CameraRobot(arm, own.cameras, finder, numbers, whole=whole)
     if own.dictionary is not None and own.board is None:
@@ -96,7 +98,7 @@ def _made(own: OwnRobot, numbers: Sequence[int], bounds: Bounds, *, whole: bool)
         raise InputError(
             f"plant {own.target}: has joints(), which brings no pixels: configure cameras, left and right"
         )
-    return robot
+    return by_joints(robot, f"plant {own.target}", own.flange_chart)
 
 
 def takes_limits(own: OwnRobot) -> bool:
