@@ -124,8 +124,8 @@ class _Screws(Section):
 class FlangeSettings(Section):
     """A controller that takes poses of the flange in the base, p_base = T p_flange, instead of joints.
 
-    Readings are the shift from home along the axes of the base, m, then turns about its x, y and z through
-    the flange.
+    Readings are the shift from home along the axes of the base, m, then turns through the flange about the
+    directions of its own x, y and z at home: two that tilt its axis, and a spin about it.
     """
 
     home: Pose = Field(description="pose of the flange from which readings count, m: its middle, if any")
@@ -133,10 +133,10 @@ class FlangeSettings(Section):
         description="minimum and maximum x, y, z of the flange in the base"
     )
     max_tilt_deg: Annotated[Positive, Field(le=80.0)] = Field(
-        45.0, description="maximum turn about x and about y of the base, from home"
+        45.0, description="maximum tilt about x and about y of the flange, from home"
     )
     max_spin_deg: Annotated[Positive, Field(le=180.0)] = Field(
-        180.0, description="maximum turn about z, from home"
+        180.0, description="maximum turn about z of the flange, from home"
     )
     max_speed_mm_s: Positive = Field(100.0, description="maximum speed along each axis")
     max_turn_deg_s: Positive = Field(30.0, description="maximum speed of each turn")
@@ -144,7 +144,8 @@ class FlangeSettings(Section):
     @property
     def chart(self) -> FlangeChart:
         """Chart of its readings."""
-        return FlangeChart(np.eye(3), np.array(self.home))
+        home = np.array(self.home)
+        return FlangeChart(home[:3, :3], home)
 
     @property
     def screws(self) -> _Screws:
@@ -156,7 +157,7 @@ class FlangeSettings(Section):
             {"type": kind, "name": name, "w": w.tolist(), "v": v.tolist(), unit: limits}
             for kind, name, (w, v), unit, limits in zip(
                 FLANGE_TYPES,
-                ("x", "y", "z", "turn about x", "turn about y", "turn about z"),
+                ("x", "y", "z", "tilt about x", "tilt about y", "spin"),
                 screws(self.chart.H_hat).reshape(6, 2, 3),
                 ["limits_m"] * 3 + ["limits_deg"] * 3,
                 slides + turns,
