@@ -150,8 +150,8 @@ def _export(
     gives meaning and unit of every array.
 
     The other kinds are in metres, by a known length: opencv the cameras for cv2.FileStorage, urdf the arm,
-    ros static transforms of the cameras, json all numbers with their covariances. Cameras on the tool come
-    in the frame of the flange: the hand–eye transformation.
+    ros static transforms of the cameras and camera_info of each, json all numbers with their covariances.
+    Cameras on the tool come in the frame of the flange: the hand–eye transformation.
 
     With --nominal it lists the errors of zeros and axes of a model, by significance. With --frames
     model, the cameras are in the base of that model, such as a robot's own, and the tool is its tip. Cameras
@@ -177,10 +177,11 @@ def _export(
         raise click.UsageError("--frames model needs the model: --nominal URDF")
     option.require_new(folder, force=force)
     model = None if nominal is None else (nominal, tip, frames == "model")
-    content, value, words = _in_metres(found, to, (metric, between, metric_std), model)
-    file = write_whole(folder / _KINDS[to], content)
-    value = {"run": found.path.resolve(), "files": [file.resolve()], **value}
-    console.report(value, [f"export: {file}", *(wrapped(line, "  ") for line in words)])
+    contents, value, words = _in_metres(found, to, (metric, between, metric_std), model)
+    files = [write_whole(folder / name, content) for name, content in contents.items()]
+    value = {"run": found.path.resolve(), "files": [file.resolve() for file in files], **value}
+    further = [f"  and {file.name}" for file in files[1:]]
+    console.report(value, [f"export: {files[0]}", *further, *(wrapped(line, "  ") for line in words)])
 
 
 def _in_metres(
@@ -188,8 +189,8 @@ def _in_metres(
     to: str,
     length: tuple[float | None, str | None, float | None],
     model: tuple[Path, str | None, bool] | None,
-) -> tuple[str, dict[str, Any], list[str]]:
-    """Return the text of a file in metres, its JSON object, and its summary in words.
+) -> tuple[dict[str, str], dict[str, Any], list[str]]:
+    """Return the texts of files in metres by their names, their JSON object, and a summary in words.
 
     model : a URDF, its tip, and whether its frames are taken.
     """
@@ -236,7 +237,8 @@ def _in_metres(
         words.insert(0, f"cameras without skew cost Δχ² {found.skew_chi2:.3g} (2 on average)")
         if calibration.lens is not None:
             words[0] += f", OpenCV's lens {found.lens_chi2:.2g} ({found.lens_rms_px:.2g} px rms)"
-        return exports.opencv_yaml(found, config.image_size_px, metric.view, metric.mount), value, words
+        text = exports.opencv_yaml(found, config.image_size_px, metric.view, metric.mount)
+        return {_KINDS[to]: text}, value, words
     if to == "urdf":
         names = [name or f"joint_{i}" for i, name in enumerate(config.joint_names, 1)]
         names += [f"joint_{i}" for i in range(len(names) + 1, len(metric.joint_types) + 1)]
@@ -245,11 +247,13 @@ def _in_metres(
         if not np.isfinite(limits).all() and not metric.by_flange:
             words.append("where limits of joints are unknown, they are the readings of the trial motions")
         limits = np.where(np.isfinite(limits), limits, metric.range)
-        return exports.urdf(metric, names, limits), value, words
+        return {_KINDS[to]: exports.urdf(metric, names, limits)}, value, words
     if to == "ros":
         link = model[1] if model is not None and model[2] else None
-        return exports.static_transforms(metric, link or exports.FLANGE), value, words
-    return exports.to_json(metric, value), value, words
+        launch = exports.static_transforms(metric, link or exports.FLANGE)
+        infos = exports.camera_infos(found, config.image_size_px, metric.view)
+        return {_KINDS[to]: launch, **infos}, value, words
+    return {_KINDS[to]: exports.to_json(metric, value)}, value, words
 
 
 def _ends(between: str) -> Any:

@@ -6,6 +6,7 @@ from typing import Any
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
+import yaml
 from scipy.spatial.transform import Rotation
 
 from projservo_cli.geometry.displacements import rigid_inverse
@@ -47,6 +48,32 @@ def opencv_yaml(found: OpenCV, size: ImageSize | None, names: Sequence[str], mou
         stereo = world[1] @ poses[0]
         lines += _matrix("R", stereo[:3, :3]) + _matrix("T", stereo[:3, 3:])
     return "\n".join(lines) + "\n"
+
+
+def camera_infos(found: OpenCV, size: ImageSize | None, names: Sequence[str]) -> dict[str, str]:
+    """Files of the cameras by name for ROS's camera_info_manager, as its calibration writes them.
+
+    size : width and height, px; none are written without it, as ROS needs it.
+    """
+    if size is None:
+        return {}
+    K, files = found.body.intrinsics(), {}
+    K[:, 0, 1] = 0.0  # rounding errors
+    for v, (name, (width, height)) in enumerate(zip(names, image_sizes(size, names), strict=True)):
+        rows = {
+            "camera_matrix": K[v],
+            "distortion_coefficients": found.distortion[v : v + 1],
+            "rectification_matrix": np.eye(3),
+            "projection_matrix": np.column_stack([K[v], np.zeros(3)]),
+        }
+        values = {
+            key: {"rows": len(M), "cols": M.shape[1], "data": M.ravel().tolist()} for key, M in rows.items()
+        }
+        about = {"image_width": int(width), "image_height": int(height), "camera_name": name}
+        files[f"{name}_info.yaml"] = yaml.safe_dump(
+            about | {"distortion_model": "plumb_bob"} | values, sort_keys=False, default_flow_style=None
+        )
+    return files
 
 
 def _matrix(name: str, values: FloatArray) -> list[str]:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 import projservo_cli as projservo
 from projservo_cli.calibration.bundle_adjustment import BOARD, LeastSquares
@@ -158,7 +159,12 @@ def test_a_run_with_a_board_validates_refits_and_exports_metres(projservo, tmp_p
     found = projservo("calibrate", "run", "--refit", "top", "--data", "moved.csv", "-o", "new")
     assert found.code == 0, found.err
     assert projservo("validate", "new", "--data", "moved.csv").code == 0
-    assert projservo("export", "new", "--to", "json").code == 0
+    for kind in ("json", "ros"):
+        assert projservo("export", "new", "--to", kind).code == 0
+    info = yaml.safe_load(Path("new/ros/low_info.yaml").read_text())
+    assert (info["image_width"], info["distortion_model"]) == (1280, "plumb_bob")
+    K = np.reshape(info["camera_matrix"]["data"], (3, 3))
+    np.testing.assert_allclose(K, board_arms.K, atol=8.0)  # to 1 % of the focal length
     metric = json.loads(Path("new/json/metric.json").read_text())
     X = np.array(metric["markers"])[[0, 47]]
     assert np.linalg.norm(X[0] - X[1]) == pytest.approx(PITCH * np.hypot(7, 5), rel=1e-3)

@@ -46,7 +46,7 @@ Q = np.array([[0.3, -1.2, 1.1, -0.4, 0.8, 0.2], [0.1, -1.0, 1.4, -0.8, 1.1, -0.6
 
 def export(ur5, tmp_path, kind, *more):
     assert run(["export", str(ur5), "--to", kind, "-o", str(tmp_path / kind), *KNOWN, *more]) == 0
-    (file,) = (tmp_path / kind).iterdir()
+    (file,) = (path for path in (tmp_path / kind).iterdir() if "_info" not in path.name)
     return file
 
 

@@ -91,7 +91,7 @@ def recorded(tmp_path_factory):
 def export(folder, kind, *more):
     out = folder / f"{kind}{len(more)}"
     assert run(["export", str(folder / "run"), "--to", kind, "-o", str(out), *TAG, *more]) == 0
-    (file,) = out.iterdir()
+    (file,) = (path for path in out.iterdir() if "_info" not in path.name)
     return file
 
 
