@@ -43,22 +43,36 @@ def with_known_shapes(
 
     free : fit of all markers as points.
     """
-    held = tuple(_placed(boards, free))
-    if not held:
-        return free, (), []
-    solution = _fitted(free, held, expected)
-    if solution is not None and _chance(solution, free) >= _BY_CHANCE:
-        return solution, held, [*_other_pitches(solution, held)]
-    return free, (), [_contradicted(board, free) for board in held]
+    placed = [board for board in boards if _placed(board, free) >= _LEAST_CORNERS]
+    findings = [_unplaced(board, _placed(board, free)) for board in boards if board not in placed]
+    solution = _agreeing(free, placed, expected)
+    if solution is None and len(placed) > 1:  # which of them it is
+        alone = {board: _agreeing(free, [board], expected) is not None for board in placed}
+        findings += [_contradicted(board, free) for board, agrees in alone.items() if not agrees]
+        placed = [board for board, agrees in alone.items() if agrees]
+        solution = _agreeing(free, placed, expected)
+    if solution is None:
+        return free, (), findings + [_contradicted(board, free) for board in placed]
+    return solution, tuple(placed), [*findings, *_other_pitches(solution, placed)]
 
 
-def _placed(boards: Sequence[StatedBoard], free: Solution) -> Iterator[StatedBoard]:
-    """Yield the boards of which a fit places enough corners off one line."""
-    for board in boards:
-        places = board.places_of(free.problem.detections.marker)
-        found = places[np.isfinite(places).all(axis=1)]
-        if len(found) >= _LEAST_CORNERS and np.linalg.matrix_rank(found - found[0]) == 2:
-            yield board
+def _placed(board: StatedBoard, free: Solution) -> int:
+    """Number of corners of a board that a fit places, zero if they are on one line."""
+    places = board.places_of(free.problem.detections.marker)
+    found = places[np.isfinite(places).all(axis=1)]
+    return len(found) if len(found) and np.linalg.matrix_rank(found - found[0]) == 2 else 0
+
+
+def _unplaced(board: StatedBoard, count: int) -> Finding:
+    """Tell that too few corners of a board are known."""
+    subject = Subject(name=f"{board.columns}x{board.rows}", markers=(board.first,))
+    return Finding("unplaced_board", LIMITS, subject, count, limit=_LEAST_CORNERS, unit="1")
+
+
+def _agreeing(free: Solution, boards: Sequence[StatedBoard], expected: Expected) -> Solution | None:
+    """Fit with the shapes of boards; None without any, or if the images contradict them."""
+    solution = _fitted(free, boards, expected) if boards else None
+    return None if solution is None or _chance(solution, free) < _BY_CHANCE else solution
 
 
 def _fitted(free: Solution, boards: Sequence[StatedBoard], expected: Expected) -> Solution | None:

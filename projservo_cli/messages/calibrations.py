@@ -94,6 +94,10 @@ CALIBRATION = {
         "squares of the board {name} are {pitches}",
         "measure the board, and look at the unit and the scale of the readings",
     ),
+    "unplaced_board": Row(
+        "{amount} corners of the board {name} from marker {numbers} are known; its shape takes {limit}",
+        "mend its first marker, columns and rows, or show it in more images",
+    ),
     "unused_shape": Row(
         "the board {name} is not as stated: its corners lie {amount} squares off, and squares are {stretch} "
         "along its rows than across; its shape is not used",

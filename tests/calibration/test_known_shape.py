@@ -120,6 +120,20 @@ def test_a_board_of_other_columns_is_said():
     assert [one.code for one in found.findings if one.code.endswith("shape")] == ["unused_shape"]
 
 
+def test_of_several_boards_the_wrong_one_is_said_and_the_others_are_used():
+    """Half of the corners are a board as stated, the others are not; a third is nowhere."""
+    halves = StatedBoard(0, 8, 3), StatedBoard(24, 8, 3), StatedBoard(90, 8, 3)
+    bent = lambda X: X * np.where(np.arange(48) < 24, 1.0, 1.01)[:, None] ** [1, 0, 0]  # noqa: E731
+    found = by_flange(np.random.default_rng(0), shape=bent, boards=halves)
+    assert found.boards.tolist() == [[0.0, 8.0, 3.0, pytest.approx(np.nan, nan_ok=True)]]
+    said = [one for one in found.findings if one.code in ("unused_shape", "unplaced_board")]
+    assert sorted((one.code, *one.subject.markers) for one in said) == [
+        ("unplaced_board", 90),
+        ("unused_shape", 24),
+    ]
+    assert "0 corners of the board 8x3 from marker 90 are known; its shape takes 6" in said_of(said)
+
+
 def test_positions_that_are_short_against_a_board_are_said_with_their_factor():
     found = by_flange(np.random.default_rng(0), boards=(StatedBoard(0, 8, 6, 1.0045 * flange.PITCH),))
     said = [one for one in found.findings if one.code == "other_pitch"]
