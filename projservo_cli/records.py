@@ -266,6 +266,9 @@ def board_numberings(rows: int, columns: int) -> IntArray:
     return np.stack([np.rot90(index, k).ravel() for k in range(0, 4, 1 if rows == columns else 2)])
 
 
+ONLY = "camera"
+"""Name of the camera of a file of intrinsics that is given without one, where there is but one."""
+
 LEAST_CORNERS = 2
 """Minimum number of corners in a row or a column of a board."""
 

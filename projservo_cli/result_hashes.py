@@ -58,7 +58,7 @@ _FIRST_MODULES = {
 }
 # Fields that records had not at first: they count where they are not as by default, so that older keys hold.
 _ADDED: dict[str, dict[str, Any]] = {
-    "Estimation": {"boards": ()},
+    "Estimation": {"boards": (), "intrinsics": ()},
     "Markers": {"boards": None},
     **{name: {"flange_chart": None} for name in ("JointSettings", "OwnRobot", "Table")},
 }

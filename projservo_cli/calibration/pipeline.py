@@ -135,6 +135,7 @@ def calibrate(
     mount: str = WORLD,
     joint_model: str | Sequence[str] | None = None,
     boards: Sequence[StatedBoard] = (),
+    lenses: FloatArray | None = None,
     fitted: Callable[[Solution, float], None] | None = None,
     progress: Progress = lambda what, done, total: None,
 ) -> Calibration:
@@ -162,6 +163,7 @@ def calibrate(
         show, or some of ``CURVES``, of all joints or of one, as ``scale:2``; None where joints are as they
         read.
     boards : boards whose corners are markers; their shape is used unless the images contradict it.
+    lenses : (V, 5) known lenses of the views; None where they are ideal, or estimated.
     fitted : called with the solution of ``bundle_adjustment`` and its noise, px.
     progress : called with the current task of ``bundle_adjustment``, how much of it is done, and its total.
 
@@ -187,6 +189,8 @@ def calibrate(
         raise InputError(f"joint noise {joint_noise!r}: give a number that is not negative, or none")
     if mount not in (WORLD, TOOL):
         raise InputError(f"mount {mount!r}: choose {WORLD} or {TOOL}")
+    if lens and lenses is not None:
+        raise InputError("lenses are known and to be estimated (--intrinsics, --lens): leave one out")
     if mount == TOOL and init is not None:
         raise InputError("cameras on the tool are calibrated from images alone: leave out init")
     curves = None if joint_model == AUTO else hypotheses_of(joint_model or (), joint_types, mount)
@@ -202,6 +206,7 @@ def calibrate(
         require_enough_poses(whole)
         if image_size is not None:
             _require_inside(whole, image_size, _LENS_STRAYS if lens else _STRAYS)
+        whole = undistorted(whole, lenses)
         require_images(whole, sigma_px)
         whole = with_best_pair(whole)
         detections = whole.of_pair()
@@ -227,6 +232,8 @@ def calibrate(
         seconds = time.perf_counter() - begin
         if fitted is not None:
             fitted(solution, expected.noise_px(solution))
+        if lenses is not None:
+            result = changed(result, lens=lenses)
         if mount == TOOL:
             result = along_the_arm(result)
         result = with_time_offset(result, observation)

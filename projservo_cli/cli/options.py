@@ -187,6 +187,12 @@ def overrides(options: Mapping[str, Any]) -> list["Override"]:
         values: Any = [one for _, one in sizes]
         values = dict(zip(names, values, strict=True)) if names else values if len(values) > 1 else values[0]
         found.append(Override(flag, "data.image_size_px", values))
+    if (text := options.get("intrinsics")) is not None:
+        from projservo_cli.records import ONLY
+
+        named = [one.rpartition("=")[::2] for one in text.split(",")]
+        given = {name or ONLY: os.path.abspath(file) for name, file in named}
+        found.append(Override(f"--intrinsics {text}", "calibration.intrinsics", given))
     if (text := options.get("board")) is not None:
         from projservo_cli.detection.finders import Board
 

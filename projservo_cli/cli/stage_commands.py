@@ -54,6 +54,11 @@ _OF_STAGES = (
         help="The table's markers are corners of a board: chessboard:9x7:25mm (inner corners) or "
         "charuco:11x8 (squares), from marker 0. A fit uses its shape.",
     ),
+    click.option(
+        "--intrinsics",
+        metavar="[NAME=]FILE,...",
+        help="YAML file of each camera by OpenCV or ROS: its lens is taken, its focal lengths are compared.",
+    ),
     click.option("--joints", metavar="RRPRRR", help="Type of each joint of the table. Default: all R."),
     option.joint_unit(help="Unit of the table's revolute joints. Default: rad."),
     click.option(
@@ -416,7 +421,8 @@ def _of_refit(options: Mapping[str, Any]) -> tuple["Config", "Run"]:
         raise click.UsageError(f"{flag}: takes --data TABLE, images by that camera, and -o, another run")
     if run_path(options["output"]).resolve() == before.path.resolve():
         raise click.UsageError(f"{flag}: -o {options['output']} is the run itself; name another")
-    for name in ("config", "mount", "joints", "noise_px", "lens", "init", "cross_validate", "image_size"):
+    of_first = "config mount joints board intrinsics noise_px lens init cross_validate image_size"
+    for name in of_first.split():
         if options[name]:
             text = f"the one in {before.path.parent} holds; leave it out"
             raise click.UsageError(f"--{name.replace('_', '-')} and {flag}: {text}")

@@ -95,6 +95,9 @@ def calibration_inputs(config: Config, files: Files | None = None) -> Calibratio
         settings.max_predicted_px,
         settings.joint_model,
         config.markers.stated_boards if config.markers is not None else (),
+        tuple(
+            (name, _file(f"camera {name}", file, files)) for name, file in (settings.intrinsics or {}).items()
+        ),
     )
     inputs: CalibrationInputs | RefitInputs = CalibrationInputs(source, how, settings.joint_noise)
     for i, one in enumerate(settings.refits):
@@ -390,6 +393,7 @@ def files_of(config: Config, gone: Mapping[str, str] | None = None) -> Files:
         "init": config.calibration.init,
         "mjcf": config.arm.mjcf if config.arm is not None and rendered else None,
     }
+    paths |= {f"camera {name}": file for name, file in (config.calibration.intrinsics or {}).items()}
     for i, one in enumerate(config.calibration.refits):
         paths |= {f"refit {i}": one.table, f"refit readings {i}": one.readings}
     return {role: _read(role, path, gone) for role, path in paths.items() if path is not None}
@@ -407,7 +411,10 @@ def _file_if(role: str, path: str | None, files: Files | None) -> File | None:
 
 def _read(role: str, path: str, gone: Mapping[str, str] | None = None) -> File:
     """Read the file of a role; an InputError if it cannot be read."""
-    expected = _EXPECTED.get(role, "a table of a camera that moved")
+    of_camera = "a YAML file of a camera by OpenCV or ROS"
+    expected = _EXPECTED.get(
+        role, of_camera if role.startswith("camera ") else "a table of a camera that moved"
+    )
     return File.of(path, expected, (gone or {}).get(path, ""), files_named(path) if role == "mjcf" else ())
 
 

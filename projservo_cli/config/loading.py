@@ -574,6 +574,10 @@ def _fill_in(values: dict[str, Any], path: pathlib.Path | str | None) -> None:
         if isinstance(part, dict) and isinstance(part.get(key), str) and part[key]:
             part[key] = str((base / part[key]).resolve())
     calibration = values.get("calibration")
+    cameras = calibration.get("intrinsics") if isinstance(calibration, dict) else None
+    if isinstance(cameras, dict):
+        for name, file in cameras.items():
+            cameras[name] = str((base / file).resolve()) if isinstance(file, str) and file else file
     refits = calibration.get("refits") if isinstance(calibration, dict) else None
     for one in list[Any](refits) if isinstance(refits, list) else list[Any]():
         for key in ("table", "readings") if isinstance(one, dict) else ():

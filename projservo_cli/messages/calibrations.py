@@ -90,6 +90,11 @@ CALIBRATION = {
     "unmodelled_lens": Row(
         "lens distortion would explain {percent} % of the squared residuals", "try --lens", limit="lens"
     ),
+    "other_intrinsics": Row(
+        "the focal length of the {view} camera is {amount} by the images, and {limit} by its file",
+        "look whether the file is of this camera, and of this zoom, focus and size of images",
+        limit="the {view} camera, which is not as its file",
+    ),
     "other_pitch": Row(
         "squares of the board {name} are {pitches}",
         "measure the board, and look at the unit and the scale of the readings",

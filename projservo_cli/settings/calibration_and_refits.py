@@ -77,6 +77,11 @@ class CalibrationSettings(Section):
         False,
         description="whether to estimate radial distortion: two coefficients a camera, and its centre",
     )
+    intrinsics: dict[str, Text] | None = Field(
+        None,
+        description="YAML file of each camera by its name, as OpenCV or ROS writes it: its lens is taken, "
+        "and its focal lengths are compared with the images",
+    )
     joint_model: Literal["auto"] | tuple[str, ...] | None = Field(
         None,
         description=f"curves of joints to fit: auto, or a list of {', '.join(CURVES)}, of all joints or of "

@@ -197,6 +197,7 @@ class Estimation:
     max_predicted_px: float | None = None  # error by deviations from the model that is accepted, px
     joint_model: str | tuple[str, ...] | None = None  # auto, or curves of joints to fit
     boards: tuple[StatedBoard, ...] = ()  # boards whose corners are markers, of known shape
+    intrinsics: tuple[tuple[str, File], ...] = ()  # file of each camera that is known, by its name
 
 
 @dataclass(frozen=True, eq=False)

@@ -105,7 +105,7 @@ def by_poses():
     words = (
         f"robot={{name: UR5e by poses, flange: {{home: {home.tolist()}, box_mm: {box}, max_tilt_deg: 60, "
         "max_speed_mm_s: 250, max_turn_deg_s: 60}}",
-        "plant={use: 'tests.studies.by_poses:Controller', settle_s: 0.3, averaged_frames: 2}",
+        "plant={use: 'tests.studies.by_poses:Controller', settle_s: 0.3, averaged_frames: 2, timeout_s: 60}",
         "calibration={frames_per_joint: 4, random_poses: 10, amplitude_deg: 25, amplitude_m: 0.12, "
         f"reference: {AT_HOME}}}",
         f"task={{start: {AT_HOME}, goal: {{joints: {AT_HOME}}}}}",

@@ -1,0 +1,148 @@
+"""Files of calibrated cameras, as OpenCV and ROS write them: intrinsics and lens of one camera."""
+
+import re
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import yaml
+
+from projservo_cli.geometry.lens import distort
+from projservo_cli.records import FloatArray, InputError
+
+# Steps of the fit of a lens, points along a side of the image at which it is fitted, and its maximum rms
+# error, px.
+_STEPS, _GRID, _MAX_OFF_PX = 30, 17, 0.3
+_MODELS = {
+    "plumb_bob": "plumb_bob",
+    "rational_polynomial": "plumb_bob",
+    "radtan": "plumb_bob",
+} | dict.fromkeys(("fisheye", "equidistant"), "fisheye")
+
+
+class Intrinsics(NamedTuple):
+    """A camera as a file states it."""
+
+    K: FloatArray  # (3, 3) px, of the raw image
+    lens: FloatArray  # (5,) nearest lens of the calibration: u, v, radius, px, k1, k2
+    size: tuple[int, int] | None  # width and height, px, if stated
+    off_px: float  # rms distance of both lenses over the image, px
+
+
+def read_intrinsics(path: Path | str) -> Intrinsics:
+    """Read a camera of a YAML file of OpenCV (``camera_matrix``) or of ROS's ``camera_info``.
+
+    Raises InputError if the file is none of these, or if its lens is beyond two radial terms.
+    """
+    values = _document(path)
+    names = ("camera_matrix", "cameraMatrix", "K", "k")
+    K = _matrix(path, values, names, (3, 3))
+    if not (K[0, 0] > 0.0 and K[1, 1] > 0.0):
+        raise InputError(
+            f"{path}: {names[0]} has the focal lengths {K[0, 0]:g} and {K[1, 1]:g}: both must be positive"
+        )
+    given = str(values.get("distortion_model", "plumb_bob"))
+    if given not in _MODELS:
+        raise InputError(f"{path}: distortion_model {given}: choose among {', '.join(_MODELS)}")
+    coefficients = _matrix(path, values, ("distortion_coefficients", "distCoeffs", "D", "d"), None).ravel()
+    width, height = (values.get(name) for name in ("image_width", "image_height"))
+    size = (int(width), int(height)) if width and height else None
+    extent = np.array(size or (2.0 * K[0, 2], 2.0 * K[1, 2]))
+    lens, off = _nearest_lens(K, coefficients, _MODELS[given], extent)
+    if not off < _MAX_OFF_PX:
+        raise InputError(
+            f"{path}: two radial terms miss its lens by {off:.2g} px rms over the image, {_MAX_OFF_PX:g} at "
+            "most: leave it out, and calibrate with --lens, or undistort the images"
+        )
+    return Intrinsics(K, lens, size, off)
+
+
+def _document(path: Path | str) -> dict[str, Any]:
+    """Values of a YAML file; matrices of OpenCV are as those of ROS."""
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read: {error}; expected the YAML file of a camera") from error
+    text = re.sub(r"^%YAML[^\n]*\n", "", text).replace("!!opencv-matrix", "")
+    try:
+        values = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise InputError(f"{path}: not YAML: {' '.join(str(error).split())}") from error
+    if not isinstance(values, dict):
+        raise InputError(f"{path}: holds no camera: expected camera_matrix and distortion_coefficients")
+    return values
+
+
+def _matrix(
+    path: Path | str, values: dict[str, Any], names: tuple[str, ...], shape: tuple[int, int] | None
+) -> FloatArray:
+    """A matrix by one of its names, of a shape, or any."""
+    name = next((name for name in names if name in values), None)
+    if name is None:
+        raise InputError(f"{path}: has no {names[0]}: expected a YAML file of a camera by OpenCV or ROS")
+    given = values[name]
+    try:
+        found = np.array(given["data"] if isinstance(given, dict) else given, dtype=np.float64)
+        found = found if shape is None else found.reshape(shape)
+    except (TypeError, ValueError, KeyError) as error:
+        raise InputError(f"{path}: {name} is no matrix of numbers") from error
+    if not np.isfinite(found).all():
+        raise InputError(f"{path}: {name} holds a number that is not finite")
+    return found
+
+
+def _distorted(K: FloatArray, coefficients: FloatArray, model: str, x: FloatArray) -> FloatArray:
+    """Pixels (N, 2) of normalized points (N, 2) by the lens of OpenCV, of its plain or its fisheye module."""
+    square = (x**2).sum(axis=1, keepdims=True)
+    if model == "fisheye":
+        r = np.sqrt(square)
+        theta = np.arctan(r)
+        k = np.pad(coefficients, (0, 4))[:4]
+        bent = theta * (1.0 + sum(k[i] * theta ** (2 * i + 2) for i in range(4)))
+        y = x * np.where(r > 1e-9, bent / np.maximum(r, 1e-9), 1.0)
+    else:
+        k1, k2, p1, p2, k3, k4, k5, k6 = np.pad(coefficients, (0, 8))[:8]
+        radial = (1.0 + square * (k1 + square * (k2 + square * k3))) / (
+            1.0 + square * (k4 + square * (k5 + square * k6))
+        )
+        product = 2.0 * x[:, :1] * x[:, 1:]
+        tangential = np.hstack(
+            [
+                p1 * product + p2 * (square + 2.0 * x[:, :1] ** 2),
+                p1 * (square + 2.0 * x[:, 1:] ** 2) + p2 * product,
+            ]
+        )
+        y = x * radial + tangential
+    return np.asarray(y * np.diag(K)[:2] + K[:2, 2])
+
+
+def _nearest_lens(
+    K: FloatArray, coefficients: FloatArray, model: str, extent: FloatArray
+) -> tuple[FloatArray, float]:
+    """Lens (5,) of two radial terms nearest to that of a file over an image (2,), and its rms error, px."""
+    radius = 0.5 * float(extent.max())
+    lens = np.array([K[0, 2], K[1, 2], radius, 0.0, 0.0])
+    if not coefficients.any() and model != "fisheye":
+        return lens, 0.0
+    # Points of the scene whose images fill the raw image, where the lens bends inwards.
+    straight = np.stack(np.meshgrid(*(np.linspace(0.0, side, _GRID) for side in extent)), axis=-1).reshape(
+        -1, 2
+    )
+    x = (straight - K[:2, 2]) / np.diag(K)[:2]
+    seen = _distorted(K, coefficients, model, x)
+    within = ((seen >= 0.0) & (seen <= extent)).all(axis=1)
+    straight, seen = straight[within], seen[within]
+    for _ in range(_STEPS):
+        off = (distort(lens, straight) - seen).ravel()
+        J = np.empty((off.size, 4))
+        for column, term in enumerate((0, 1, 3, 4)):
+            step = np.zeros(5)
+            step[term] = 1e-4 if term > 1 else 1e-2
+            ends = distort(lens + step, straight) - distort(lens - step, straight)
+            J[:, column] = ends.ravel() / (2.0 * step[term])
+        change = np.linalg.lstsq(J, -off, rcond=None)[0]
+        lens[[0, 1, 3, 4]] += change
+        if np.abs(change).max() < 1e-9:
+            break
+    off = distort(lens, straight) - seen
+    return lens, float(np.sqrt((off**2).sum(axis=1).mean()))
