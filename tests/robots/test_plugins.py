@@ -35,7 +35,7 @@ def written(name, text):
         ),
         ("tests.no_such:A", r"there is no module tests\.no_such on"),
         (f"{HERE}:Faulti", r"tests\.robots\.robots has no Faulti; did you mean Faulty\?"),
-        (f"{HERE}:Zzz", r"has no Zzz; classes: Sound, Telling, Pressing, "),
+        (f"{HERE}:Zzz", r"has no Zzz; classes: Sound, ByPoses, Telling, "),
         (f"{HERE}:NOT_A_CLASS", r"is no class, but of type int"),
         (f"{HERE}:NoStop", r"lacks stop\(\); needed: open, read, command, stop, close"),
         (f"{HERE}:Old", r"lacks open\(\), close\(\); needed: open, joints,"),
