@@ -240,6 +240,8 @@ def _fit(axes: Any, figure: "style.Figure", extent: FloatArray) -> None:
 
 
 _POSES, _REGION = 5, 0.95
+# Radius of a region, mm, below which the tool is where its readings put it.
+_KNOWN_MM = 1e-6
 _ELLIPSOID_SIZE = 0.05  # size of the ellipsoids as they are drawn, over the distance of the tools
 _ELLIPSOID = style.line(style.VERMILION, width=0.8)
 
@@ -341,7 +343,9 @@ def _draw_metric(data: Data, figure: "style.Figure") -> None:
     region = f"95 % region of the tool, {float(data['factor']):,g} times (at most {largest:.3g} mm)"
     angle = np.linspace(0.0, 2.0 * np.pi, 61)[:, None]
     lines = [(data["robot"], _ROBOT | {"label": "arm at one pose"})]
-    for center, semi in zip(data["tool"], float(data["factor"]) * data["semi_axes"], strict=True):
+    known = largest < _KNOWN_MM  # by poses of the flange
+    regions = zip(data["tool"], float(data["factor"]) * data["semi_axes"], strict=True)
+    for center, semi in [] if known else regions:
         for a, b in ((0, 1), (1, 2), (2, 0)):
             ring = center + np.cos(angle) * semi[a] + np.sin(angle) * semi[b]
             lines.append((ring, _ELLIPSOID | {"label": region}))
