@@ -298,12 +298,12 @@ class StatedBoard(NamedTuple):
         """Numbers of the markers at its first and its last corner, farthest apart."""
         return self.first, self.first + self.columns * self.rows - 1
 
-    def places_of(self, markers: IntArray) -> FloatArray:
-        """Places (m, 2) of markers by their numbers, in pitches along rows and columns; NaN beside it."""
+    def positions_of(self, markers: IntArray) -> FloatArray:
+        """Places (m, 2) of markers by their numbers, in pitches along rows and columns; NaN for others."""
         at = np.asarray(markers) - self.first
-        places = np.stack([at % self.columns, at // self.columns], axis=1).astype(np.float64)
-        places[(at < 0) | (at >= self.columns * self.rows)] = np.nan
-        return places
+        positions = np.stack([at % self.columns, at // self.columns], axis=1).astype(np.float64)
+        positions[(at < 0) | (at >= self.columns * self.rows)] = np.nan
+        return positions
 
 
 def no_lenses(views: int) -> FloatArray:

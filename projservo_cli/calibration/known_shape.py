@@ -28,7 +28,7 @@ from projservo_cli.records import FloatArray, StatedBoard
 _LEAST_CORNERS = 6
 # Probability that noise alone contradicts the shape of a board as much.
 _BY_CHANCE = 1e-6
-# Difference of the pitch of a board from the stated one above which it is told, in standard deviations.
+# Difference of the pitch of a board from the stated one for a finding, in standard deviations.
 _OTHER_PITCH = 4.0
 # Change of a form of unit norm by the joints up to which these leave it open.
 _INVARIANT = 1e-6
@@ -58,8 +58,8 @@ def with_known_shapes(
 
 def _placed(board: StatedBoard, free: Solution) -> int:
     """Number of corners of a board that a fit places, zero if they are on one line."""
-    places = board.places_of(free.problem.detections.marker)
-    found = places[np.isfinite(places).all(axis=1)]
+    corners = board.positions_of(free.problem.detections.marker)
+    found = corners[np.isfinite(corners).all(axis=1)]
     return len(found) if len(found) and np.linalg.matrix_rank(found - found[0]) == 2 else 0
 
 
@@ -93,7 +93,7 @@ def _on_boards(detections: Detections, boards: Sequence[StatedBoard]) -> Detecti
     """Detections with the board of each marker."""
     which = np.full(detections.marker.size, -1)
     for b, board in enumerate(boards):
-        which[np.isfinite(board.places_of(detections.marker)[:, 0])] = b
+        which[np.isfinite(board.positions_of(detections.marker)[:, 0])] = b
     return dataclasses.replace(detections, board=which)
 
 
@@ -102,7 +102,7 @@ def _with_shapes(params: Parameters, detections: Detections, boards: Sequence[St
     M = params.M.copy()
     for b, board in enumerate(boards):
         on = np.flatnonzero(detections.board == b)
-        body = np.pad(board.places_of(detections.marker[on]), ((0, 0), (0, 1)))
+        body = np.pad(board.positions_of(detections.marker[on]), ((0, 0), (0, 1)))
         body -= body.mean(axis=0)
         points, weight = M[None, on, :3], np.ones((1, len(on)))
         R, t = aligned(body, points, weight)
@@ -145,29 +145,29 @@ def _upgraded(free: Solution, boards: Sequence[StatedBoard]) -> Parameters:
 
 def _steps(board: StatedBoard, params: Parameters, detections: Detections) -> FloatArray:
     """Steps (2, 3) from a corner of a board to the next, along its rows and its columns."""
-    places = board.places_of(detections.marker)
-    on = np.isfinite(places[:, 0])
-    return board_steps(places[on], params.M[on, :3])
+    corners = board.positions_of(detections.marker)
+    on = np.isfinite(corners[:, 0])
+    return board_steps(corners[on], params.M[on, :3])
 
 
-def _chance(held: Solution, free: Solution) -> float:
+def _chance(fixed: Solution, free: Solution) -> float:
     """Probability that noise alone raises the squares of a fit as much by the shapes of boards."""
-    both = held.used & free.used
+    both = fixed.used & free.used
     of_held, of_free = (
         float((one.residual[both] ** 2).sum() + (one.problem.strain(one.params) ** 2).sum())
-        for one in (held, free)
+        for one in (fixed, free)
     )
-    more = free.problem.free - held.problem.free
+    more = free.problem.free - fixed.problem.free
     return float(fdtrc(more, free.dof, max(of_held / of_free - 1.0, 0.0) * free.dof / more))
 
 
-def _other_pitches(held: Solution, boards: Sequence[StatedBoard]) -> Iterator[Finding]:
+def _other_pitches(fixed: Solution, boards: Sequence[StatedBoard]) -> Iterator[Finding]:
     """Yield a finding for each board whose pitch by readings in metres is not as stated."""
-    params, problem = held.params, held.problem
+    params, problem = fixed.params, fixed.problem
     if not (params.known_arm or params.prismatic.any()) or all(board.pitch_m is None for board in boards):
         return
-    sizes = held.sigma_px * np.linalg.norm(
-        held.errors().shared[problem.curved.stop + BOARD - 1 :: BOARD], axis=1
+    sizes = fixed.sigma_px * np.linalg.norm(
+        fixed.errors().shared[problem.curved.stop + BOARD - 1 :: BOARD], axis=1
     )
     speed = 1.0 if params.known_arm else float(np.linalg.norm(params.H_hat[params.prismatic][0, :3, 3]))
     for board, relative in zip(boards, sizes, strict=True):
@@ -182,7 +182,7 @@ def _contradicted(board: StatedBoard, free: Solution) -> Finding:
     params, detections = _upgraded(free, [board]), free.problem.detections
     a, b = _steps(board, params, detections)
     longer = float(np.linalg.norm(a) / np.linalg.norm(b) - 1.0)
-    on = np.flatnonzero(np.isfinite(board.places_of(detections.marker)[:, 0]))
+    on = np.flatnonzero(np.isfinite(board.positions_of(detections.marker)[:, 0]))
     shaped = _with_shapes(params, _on_boards(detections, [board]), [board]).M[on, :3]
     off = np.linalg.norm(params.M[on, :3] - shaped, axis=1) / np.sqrt(np.linalg.norm(a) * np.linalg.norm(b))
     subject = Subject(name=f"{board.columns}x{board.rows}", markers=(board.first,))

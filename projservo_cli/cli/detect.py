@@ -253,10 +253,10 @@ def _of_bag(
 
 
 def _require_no(**others: object) -> None:
-    """Refuse readings from elsewhere beside those of episodes."""
+    """Refuse other readings than those of episodes."""
     for name, given in others.items():
         if given is not None:
-            raise click.UsageError(f"--lerobot: has readings of its own; leave out --{name}")
+            raise click.UsageError(f"--lerobot: has its own readings; leave out --{name}")
 
 
 def _of_episodes(
@@ -351,7 +351,7 @@ def _detect_episodes(
 def _sources(images: tuple[str, ...], of: str = "IMAGES") -> dict[str, str]:
     """Folders or patterns of the images by the names of the cameras; a UsageError if these are none.
 
-    of : what the names are of; left and right have none only if it is images.
+    of : kind of what is named; left and right have none only if it is images.
     """
     from projservo_cli.records import VIEWS
     from projservo_cli.settings.sections import is_view

@@ -23,7 +23,7 @@ _LEAST = 3
 class Readings:
     """Readings of a topic, as messages bring them.
 
-    where : bag and topic, for messages; notes : takes sentences on what is left out.
+    where : bag and topic, for messages; notes : takes sentences on messages that are left out.
     """
 
     def __init__(self, where: str, notes: list[str]) -> None:

@@ -26,8 +26,8 @@ _STATIC = "_static"  # ends the topic of transforms that do not change
 _OFTEN = 50
 _MOSAIC = "mosaic"
 # Windows of a mosaic, in cells: of the means that are looked at, of the brightest of them, which is white
-# beside each edge of a tag, and over which white is smoothed. On drawn tags before grey and coloured walls
-# corners err 1.01 to 1.1 times as much as with all colours in each pixel, 1.4 times where blue is faint;
+# on each side of an edge of a tag, and over which white is smoothed. On drawn tags before grey and coloured
+# walls corners err 1.01 to 1.1 times as much as with all colours in each pixel, 1.4 times where blue is faint;
 # with interpolated colours 1.3 to 1.9 times.
 _MEAN, _WHITE, _SMOOTH = 5, 31, 61
 # Channels of the encodings of sensor_msgs/image_encodings.hpp, and how OpenCV makes grey of them.
@@ -200,7 +200,7 @@ def _pixels(message: Any, where: str) -> tuple[Any, str]:
 
 
 class BagSeries(NamedTuple):
-    """Images and readings of a bag, and what is to be said of them."""
+    """Images and readings of a bag, and notes on them."""
 
     series: ImageSeries
     fate: dict[str, dict[str, int]]  # of each camera, how many images became what

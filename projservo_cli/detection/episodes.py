@@ -28,7 +28,7 @@ _SLOW = math.radians(5.0)
 _HALF_S = 0.1
 # Minimum distance of two poses of an episode in a joint, rad: nearer ones show the same again.
 _APART = math.radians(1.0)
-# Number of poses of all episodes, and the least and most of one: calibration takes a minute or less.
+# Number of poses of all episodes, and the minimum and maximum of one: calibration takes a minute or less.
 _ALL, _LEAST, _MOST = 600, 8, 40
 # Frames of a motion out of a rest, by which calibrate measures the delay of images, and number of motions.
 _MOTION, _MOTIONS = 15, 6
@@ -54,7 +54,7 @@ _LARGEST = {"deg": math.degrees(TWO_TURNS), "rad": TWO_TURNS, _NORMALISED: _FULL
 
 
 class Episodes(NamedTuple):
-    """Chosen frames of episodes, and what was left out."""
+    """Chosen frames of episodes, and counts of the others."""
 
     series: ImageSeries  # joints in rad
     joints: list[str]  # their names
@@ -102,7 +102,7 @@ def read_episodes(
 
     folder : data set with ``meta/info.json``; chosen : numbers of the episodes, None for all.
     cameras : by the name of each view, the key of its images; empty for all of the data set.
-    state_unit : of the joints, None to take what the data set says; calibration_file : of normalised ones.
+    state_unit : of the joints, None as the data set states; calibration_file : of normalised ones.
     Raises InputError if the data set cannot be read, or does not say what its numbers mean.
     """
     data = _DataSet.of(folder)

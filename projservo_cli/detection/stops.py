@@ -22,7 +22,7 @@ _STILL = 2e-4
 _OF_NOISE, _OF_COUNTS = 8.0, 2.5
 # Lower quartile of the absolute value of a normal variable, and variance of second differences of noise.
 _QUARTILE, _SECOND = 0.3186, 6.0
-# Maximum of what is taken for noise, as a share of the widest range: more is slow motion.
+# Maximum that is taken for noise, as a share of the widest range: more is slow motion.
 _MOST_NOISE = 0.02
 # Longest time between readings, as a multiple of the median, and widest step of one, over which they are
 # interpolated: half a turn is a joint that passes the end of its circle.
@@ -118,7 +118,7 @@ def shots(stream: Stream, stamps: list[FloatArray]) -> Shots:
 
     stamps : (k,) times of the images of each camera, s, rising.
     Each stop at which every camera took an image has the one of each next to its middle. Each image in
-    motion is a pose of its own, with those of other cameras at the same time.
+    motion is its own pose, with those of other cameras at the same time.
     """
     V, stops = len(stamps), stream.stops()
     fate = [np.full(len(t), MOVING, dtype=object) for t in stamps]

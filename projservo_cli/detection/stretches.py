@@ -20,10 +20,10 @@ from projservo_cli.records import WORLD, BoolArray, Calibration, FloatArray, Int
 
 # Minimum displacement of images that is one, px: what detected corners, and lenses within an episode, err.
 _MOVED_PX = 2.0
-# Displacement over what the scatter of episodes makes of it by chance, from which it is none: 190 windows of
-# twenty episodes are compared by six numbers each.
+# Minimum displacement over that by the scatter of episodes: 190 windows of twenty episodes are compared by six
+# numbers each.
 _SURE = 6.0
-# Scatter of the images of a marker within an episode, px, up to which it stands, and least images to judge.
+# Maximum scatter of the images of a marker that stands, within an episode, px, and their minimum number.
 _STANDS_PX, _LEAST = 1.0, 8
 # Poses by which half of the episodes are calibrated: more take longer and show hardly more.
 _POSES = 120

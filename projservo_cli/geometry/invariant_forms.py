@@ -42,7 +42,7 @@ def distortions_of_boards(steps: FloatArray) -> FloatArray:
     return np.asarray(np.stack([alike, across], axis=-2) / (a**2).sum(axis=-1)[..., None, None])
 
 
-def board_steps(places: FloatArray, points: FloatArray) -> FloatArray:
-    """Steps (…, 2, 3) from a corner to the next, of corners at places (k, 2) and points (…, k, 3)."""
-    rows = np.column_stack([places, np.ones(len(places))])
+def board_steps(positions: FloatArray, points: FloatArray) -> FloatArray:
+    """Steps (…, 2, 3) from a corner to the next, of corners at positions (k, 2) and points (…, k, 3)."""
+    rows = np.column_stack([positions, np.ones(len(positions))])
     return np.asarray(np.linalg.pinv(rows)[:2] @ points)

@@ -135,16 +135,16 @@ class BoardCorners(NamedTuple):
     """Corners of a board of known shape among the markers."""
 
     at: IntArray  # (k,) indices of the markers
-    places: FloatArray  # (k, 2) in pitches
+    positions: FloatArray  # (k, 2) in pitches
 
     @classmethod
     def in_calibration(cls, c: Calibration) -> tuple["BoardCorners", ...]:
         """Those of each board whose shape a calibration uses."""
         found = []
         for board in () if c.boards is None else map(StatedBoard.of, c.boards.tolist()):
-            places = board.places_of(c.marker)
-            at = np.flatnonzero(np.isfinite(places[:, 0]))
-            found.append(cls(at, places[at]))
+            positions = board.positions_of(c.marker)
+            at = np.flatnonzero(np.isfinite(positions[:, 0]))
+            found.append(cls(at, positions[at]))
         return tuple(found)
 
 
@@ -161,7 +161,7 @@ def upgrade_of(c: Calibration, H_hat: FloatArray, M: FloatArray) -> FloatArray:
     D, a_inf, L = _actions(H_hat)
     X = M @ D.swapaxes(-1, -2) / (M @ a_inf[..., None])
     slides = (D[..., None, :, :] @ H_hat[..., c.prismatic, :, :] @ M[..., None, 0, :, None])[..., 0]
-    steps = np.stack([board_steps(one.places, X[..., one.at, :]) for one in boards], axis=-3)
+    steps = np.stack([board_steps(one.positions, X[..., one.at, :]) for one in boards], axis=-3)
     rows = [
         changes_by_rotations(L[..., ~c.prismatic, :, :].swapaxes(-1, -2)),
         differences_of_lengths(slides),
@@ -518,7 +518,7 @@ def _pitch_of_boards(c: Calibration) -> tuple[float | None, Scale]:
         ends = [number for number in board.longest if number in c.marker]
         if board.pitch_m is not None and len(ends) == 2:
             return float(
-                np.linalg.norm(np.diff(board.places_of(np.array(ends)), axis=0))
+                np.linalg.norm(np.diff(board.positions_of(np.array(ends)), axis=0))
             ) * board.pitch_m, ends
     return None, "joint"
 

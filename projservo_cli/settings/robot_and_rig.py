@@ -124,8 +124,8 @@ class _Screws(Section):
 class FlangeSettings(Section):
     """A controller that takes poses of the flange in the base, p_base = T p_flange, instead of joints.
 
-    Readings are the shift from home along the axes of the base, m, then turns through the flange about the
-    directions of its own x, y and z at home: two that tilt its axis, and a spin about it.
+    Readings are the shift from home along the axes of the base, m, then turns through the flange about its
+    x, y and z at home: two that tilt its axis, and a spin about it.
     """
 
     home: Pose = Field(description="pose of the flange from which readings count, m: its middle, if any")
