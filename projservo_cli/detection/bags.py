@@ -27,8 +27,8 @@ _OFTEN = 50
 _MOSAIC = "mosaic"
 # Windows of a mosaic, in cells: of the means that are looked at, of the brightest of them, which is white
 # on each side of an edge of a tag, and over which white is smoothed. On drawn tags before grey and coloured
-# walls corners err 1.01 to 1.1 times as much as with all colours in each pixel, 1.4 times where blue is faint;
-# with interpolated colours 1.3 to 1.9 times.
+# walls corners err 1.01 to 1.1 times as much as with all colours in each pixel, 1.4 times where blue is
+# faint; with interpolated colours 1.3 to 1.9 times.
 _MEAN, _WHITE, _SMOOTH = 5, 31, 61
 # Channels of the encodings of sensor_msgs/image_encodings.hpp, and how OpenCV makes grey of them.
 _GREY_OF = {
