@@ -20,8 +20,8 @@ from projservo_cli.records import WORLD, BoolArray, Calibration, FloatArray, Int
 
 # Minimum displacement of images that is one, px: what detected corners, and lenses within an episode, err.
 _MOVED_PX = 2.0
-# Minimum displacement over that by the scatter of episodes: 190 windows of twenty episodes are compared by six
-# numbers each.
+# Minimum displacement over that by the scatter of episodes: 190 windows of twenty episodes are compared by
+# six numbers each.
 _SURE = 6.0
 # Maximum scatter of the images of a marker that stands, within an episode, px, and their minimum number.
 _STANDS_PX, _LEAST = 1.0, 8
