@@ -45,9 +45,7 @@ _SELDOM = 8
 @click.option(
     "--mount",
     type=click.Choice(["world", "tool"]),
-    default="world",
-    show_default=True,
-    help="With --lerobot: where the cameras are; tags are then on the tool or in the scene.",
+    help="With --lerobot: where the cameras are; tags are then on the tool or in the scene. Default: world.",
 )
 @click.option(
     "--bag",
@@ -74,13 +72,7 @@ _SELDOM = 8
     default="",
     help="Joints of JointState that are q1 ... qN. Default: those of most messages, in their order.",
 )
-@click.option(
-    "--dictionary",
-    metavar="NAME",
-    default="4X4_50",
-    show_default=True,
-    help="The tags, such as 4X4_50, ARUCO_ORIGINAL, APRILTAG_36H11.",
-)
+@option.dictionary(help="The tags, such as 4X4_50, ARUCO_ORIGINAL, APRILTAG_36H11.")
 @click.option(
     "--board",
     metavar="KIND:CxR",
@@ -111,7 +103,7 @@ def _detect(
     episodes: str | None,
     state_unit: str | None,
     calibration_file: Path | None,
-    mount: str,
+    mount: str | None,
     dictionary: str,
     board: str | None,
     points: str,
@@ -155,16 +147,29 @@ def _detect(
     if board is not None and points == "centers":
         raise click.UsageError("--points centers: is of tags; a board has corners: leave out one of both")
     finder = finder_of(None if board is None else Board.of(board), dictionary)
+    of_bag = {
+        "images": topics,
+        "readings-topic": readings_topic,
+        "frames": frames,
+        "joint-names": joint_names,
+    }
+    of_lerobot = {
+        "episodes": episodes,
+        "state-unit": state_unit,
+        "calibration-file": calibration_file,
+        "mount": mount,
+    }
+    for source, path, options in (("a --bag", bag, of_bag), ("--lerobot", lerobot, of_lerobot)):
+        if path is None and any(options.values()):
+            raise click.UsageError(f"{', '.join(f'--{name}' for name in options)}: are of {source}")
     if lerobot is not None:
-        _require_no(readings=readings, bag=bag)
+        for name, given in {"readings": readings, "bag": bag}.items():
+            if given is not None:
+                raise click.UsageError(f"--lerobot: has its own readings; leave out --{name}")
         read = _of_episodes(lerobot, episodes, images, state_unit, calibration_file)
-        _detect_episodes(console, read, finder, points, mount, output, force)
+        _detect_episodes(console, read, finder, points, mount or "world", output, force)
         return
-    if episodes or state_unit or calibration_file or mount != "world":
-        raise click.UsageError("--episodes, --state-unit, --calibration-file, --mount: are of --lerobot")
     if bag is None:
-        if topics or readings_topic or frames or joint_names:
-            raise click.UsageError("--images, --readings-topic, --frames, --joint-names: are of a --bag")
         series, extra = _of_files(console, images, readings)
     else:
         if readings is not None or readings_topic is None:
@@ -250,13 +255,6 @@ def _of_bag(
         "poses_in_motion": 0 if moving is None else int((moving > 0).sum()),
         "images": found.fate,
     }
-
-
-def _require_no(**others: object) -> None:
-    """Refuse other readings than those of episodes."""
-    for name, given in others.items():
-        if given is not None:
-            raise click.UsageError(f"--lerobot: has its own readings; leave out --{name}")
 
 
 def _of_episodes(

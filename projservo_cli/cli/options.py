@@ -59,6 +59,9 @@ _KEYS = {  # keys that options set
 configuration = functools.partial(click.option, "-c", "--config", metavar="FILE", type=click.Path())
 output = functools.partial(click.option, "-o", "--output", type=PATH)
 force = functools.partial(click.option, "--force", is_flag=True)
+dictionary = functools.partial(
+    click.option, "--dictionary", metavar="NAME", default="4X4_50", show_default=True
+)
 joint_unit = functools.partial(click.option, "--joint-unit", type=click.Choice(["deg", "rad"]))
 threads = functools.partial(click.option, "-j", "--threads", metavar="N", type=click.IntRange(1, 256))
 

@@ -40,13 +40,7 @@ _BODIES = ("roof", "plate")
     show_default=True,
     help="Side of the black square of each tag.",
 )
-@click.option(
-    "--dictionary",
-    metavar="NAME",
-    default="4X4_50",
-    show_default=True,
-    help="The tags, such as APRILTAG_36H11.",
-)
+@option.dictionary(help="The tags, such as APRILTAG_36H11.")
 @click.option(
     "--numbers", metavar="N,...", help="Single tags to print, such as 0-4,7. Default: as many as fit."
 )
