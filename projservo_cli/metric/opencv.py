@@ -33,7 +33,7 @@ class OpenCV(NamedTuple):
     def pixels(self, points: FloatArray) -> FloatArray:
         """Pixels (K, V, 2) of points (K, 3) of the frame of the cameras, by view."""
         K, straight = self.body.intrinsics(), self.body.pixels(points)
-        distorted = _terms(_normalized(K, straight)) @ self.distortion[:, :, None]
+        distorted = opencv_terms(_normalized(K, straight)) @ self.distortion[:, :, None]
         focal = np.diagonal(K[:, :2, :2], axis1=1, axis2=2)
         return np.asarray(straight + distorted[..., 0].reshape(straight.shape) * focal)
 
@@ -91,7 +91,7 @@ def _normalized(K: FloatArray, pixels: FloatArray) -> FloatArray:
     return (pixels - K[..., :2, 2]) / np.diagonal(K[..., :2, :2], axis1=-2, axis2=-1)
 
 
-def _terms(x: FloatArray) -> FloatArray:
+def opencv_terms(x: FloatArray) -> FloatArray:
     """Shifts (…, 2, 5) of normalized points (…, 2) by a unit of k1, k2, p1, p2, k3, as OpenCV has them."""
     square = (x**2).sum(axis=-1)[..., None]
     radial = [x * square**power for power in (1, 2, 3)]
@@ -113,7 +113,7 @@ def _fitted_lens(K: FloatArray, lens: FloatArray, pixels: FloatArray) -> tuple[F
         radius, angle = (part.reshape(-1, 1) for part in disk)
         pixels = lens[:2] + lens[2] * radius * np.hstack([np.cos(angle), np.sin(angle)])
     focal = np.diag(K)[:2]
-    A = (_terms(_normalized(K, pixels)) * focal[:, None]).reshape(-1, 5)
+    A = (opencv_terms(_normalized(K, pixels)) * focal[:, None]).reshape(-1, 5)
     target = (distort(lens, pixels) - pixels).ravel()
     scale = np.linalg.norm(A, axis=0)
     found = np.linalg.lstsq(A / scale, target)[0] / scale

@@ -6,13 +6,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import yaml
+from scipy.optimize import least_squares
 
 from projservo_cli.geometry.lens import distort
+from projservo_cli.metric.opencv import opencv_terms
 from projservo_cli.records import FloatArray, InputError
 
-# Steps of the fit of a lens, points along a side of the image at which it is fitted, and its maximum rms
-# error, px.
-_STEPS, _GRID, _MAX_OFF_PX = 30, 17, 0.3
+# Points along a side of the image at which a lens is fitted, and its maximum rms error, px.
+_GRID, _MAX_OFF_PX = 17, 0.3
 _MODELS = {
     "plumb_bob": "plumb_bob",
     "rational_polynomial": "plumb_bob",
@@ -101,18 +102,10 @@ def _distorted(K: FloatArray, coefficients: FloatArray, model: str, x: FloatArra
         bent = theta * (1.0 + sum(k[i] * theta ** (2 * i + 2) for i in range(4)))
         y = x * np.where(r > 1e-9, bent / np.maximum(r, 1e-9), 1.0)
     else:
-        k1, k2, p1, p2, k3, k4, k5, k6 = np.pad(coefficients, (0, 8))[:8]
-        radial = (1.0 + square * (k1 + square * (k2 + square * k3))) / (
-            1.0 + square * (k4 + square * (k5 + square * k6))
-        )
-        product = 2.0 * x[:, :1] * x[:, 1:]
-        tangential = np.hstack(
-            [
-                p1 * product + p2 * (square + 2.0 * x[:, :1] ** 2),
-                p1 * (square + 2.0 * x[:, 1:] ** 2) + p2 * product,
-            ]
-        )
-        y = x * radial + tangential
+        c = np.pad(coefficients, (0, 8))[:8]  # k1, k2, p1, p2, k3, then k4, k5, k6 of a divisor
+        shifts, radial = opencv_terms(x) * c[:5], [0, 1, 4]
+        divisor = 1.0 + square * (c[5] + square * (c[6] + square * c[7]))
+        y = (x + shifts[..., radial].sum(axis=-1)) / divisor + shifts[..., [2, 3]].sum(axis=-1)
     return np.asarray(y * np.diag(K)[:2] + K[:2, 2])
 
 
@@ -132,17 +125,12 @@ def _nearest_lens(
     seen = _distorted(K, coefficients, model, x)
     within = ((seen >= 0.0) & (seen <= extent)).all(axis=1)
     straight, seen = straight[within], seen[within]
-    for _ in range(_STEPS):
-        off = (distort(lens, straight) - seen).ravel()
-        J = np.empty((off.size, 4))
-        for column, term in enumerate((0, 1, 3, 4)):
-            step = np.zeros(5)
-            step[term] = 1e-4 if term > 1 else 1e-2
-            ends = distort(lens + step, straight) - distort(lens - step, straight)
-            J[:, column] = ends.ravel() / (2.0 * step[term])
-        change = np.linalg.lstsq(J, -off, rcond=None)[0]
-        lens[[0, 1, 3, 4]] += change
-        if np.abs(change).max() < 1e-9:
-            break
+    free = [0, 1, 3, 4]
+
+    def off_by(values: FloatArray) -> FloatArray:
+        lens[free] = values
+        return np.asarray((distort(lens, straight) - seen).ravel())
+
+    lens[free] = least_squares(off_by, lens[free], x_scale=[1.0, 1.0, 1e-3, 1e-3]).x
     off = distort(lens, straight) - seen
     return lens, float(np.sqrt((off**2).sum(axis=1).mean()))
