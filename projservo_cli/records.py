@@ -334,7 +334,7 @@ def coordinate_names(flange_chart: FloatArray | None) -> tuple[str, ...]:
     """Names of the coordinates of poses of a flange, by their chart (2, 4, 4); none for joints."""
     if flange_chart is None:
         return ()
-    turns = (f"the turn about {'xyz'[int(np.argmax(axis))]}" for axis in flange_chart[0, :3, :3].T)
+    turns = (f"the turn about {'xyz'[int(np.argmax(np.abs(axis)))]}" for axis in flange_chart[0, :3, :3].T)
     return "x", "y", "z", *turns
 
 
