@@ -73,7 +73,7 @@ def _similarities(params: Parameters, board: tuple[int, ...]) -> FloatArray:
 
     board : (m,) index of the board of each marker, −1 for none.
     """
-    which, M = np.array(board), params.M[:, :3]
+    which, M = np.array(board, dtype=np.int64), params.M[:, :3]
     boards = np.unique(which[which >= 0])
     B = np.zeros((len(boards), BOARD, 4, 4))
     for b, one in zip(B, boards, strict=True):
@@ -229,7 +229,10 @@ class LeastSquares:
             velocity = (params.M @ b.transpose(2, 1, 0).reshape(4, -1)).reshape(-1, 4, BOARD)
             velocity[detections.board != board] = 0.0
             blocks.append(D[-1] @ velocity[detections.marker_of])
-        blocks.append(D[-1][..., :3] * ~detections.on_board[detections.marker_of, None, None])
+        own = D[-1][..., :3]
+        if detections.board is not None:
+            own = own * ~detections.on_board[detections.marker_of, None, None]
+        blocks.append(own)
         return np.concatenate(blocks, axis=3) * detections.weight[..., None, None]
 
     def joint_derivative(self, params: Parameters) -> FloatArray:
@@ -245,12 +248,13 @@ class LeastSquares:
         x, further = x[: self.size], x[self.size :]
         H_hat = params.H_hat if params.known_arm else self._moved_screws(params, x)
         M = params.M.copy()
-        own = ~self.detections.on_board
-        M[own, :3] += x[self.shared :].reshape(-1, 3)[own]
-        B = _similarities(params, self.detections.board_key)
-        motions = expm((x[self.curved.stop : self.shared].reshape(-1, BOARD, 1, 1) * B).sum(axis=1))
-        for motion, board in zip(motions, self.detections.boards, strict=True):
-            M[self.detections.board == board] @= motion.T
+        M[:, :3] += x[self.shared :].reshape(-1, 3)
+        if self.detections.board is not None:
+            B = _similarities(params, self.detections.board_key)
+            motions = expm((x[self.curved.stop : self.shared].reshape(-1, BOARD, 1, 1) * B).sum(axis=1))
+            for motion, board in zip(motions, self.detections.boards, strict=True):
+                on = self.detections.board == board
+                M[on] = params.M[on] @ motion.T
         lens = params.lens
         if lens is not None:
             lens = lens.copy()

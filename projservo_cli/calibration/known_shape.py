@@ -43,8 +43,9 @@ def with_known_shapes(
 
     free : fit of all markers as points.
     """
-    placed = [board for board in boards if _placed(board, free) >= _LEAST_CORNERS]
-    findings = [_unplaced(board, _placed(board, free)) for board in boards if board not in placed]
+    counts = {board: _placed(board, free) for board in boards}
+    placed = [board for board, count in counts.items() if count >= _LEAST_CORNERS]
+    findings = [_unplaced(board, count) for board, count in counts.items() if board not in placed]
     solution = _agreeing(free, placed, expected)
     if solution is None and len(placed) > 1:  # which of them it is
         alone = {board: _agreeing(free, [board], expected) is not None for board in placed}
@@ -82,11 +83,12 @@ def _fitted(free: Solution, boards: Sequence[StatedBoard], expected: Expected) -
     params = _with_shapes(_upgraded(free, boards), detections, boards)
     start = minimize(problem, params, free.used, robust=True, max_steps=50).params
     found = fit_inliers(problem, start, free.sigma_px, min_px=expected.min_px or 1e-9)
-    if found is None or free.joint_noise is None or free.problem.tau is None:
-        return found if found is None else dataclasses.replace(found, joint_noise=free.joint_noise)
-    return fit_joint_noise(
-        found, expected, None if free.joint_noise.interval is not None else free.joint_noise.sigma_q
-    )
+    noise = free.joint_noise
+    if found is None or noise is None:
+        return found
+    if free.problem.tau is None:  # none shows, or exact readings were stated
+        return dataclasses.replace(found, joint_noise=noise)
+    return fit_joint_noise(found, expected, noise.sigma_q if noise.interval is None else None)
 
 
 def _on_boards(detections: Detections, boards: Sequence[StatedBoard]) -> Detections:

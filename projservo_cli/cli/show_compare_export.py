@@ -252,6 +252,8 @@ def _in_metres(
         link = model[1] if model is not None and model[2] else None
         launch = exports.static_transforms(metric, link or exports.FLANGE)
         infos = exports.camera_infos(found, config.image_size_px, metric.view)
+        if not infos:
+            words.append("camera_info needs the size of the images: calibrate with --image-size")
         return {_KINDS[to]: launch, **infos}, value, words
     return {_KINDS[to]: exports.to_json(metric, value)}, value, words
 

@@ -493,8 +493,8 @@ class Board(NamedTuple):
     @classmethod
     def of(cls, text: str) -> "Board":
         """Read such as ``chessboard:9x7``, 9 columns and 7 rows. Raises InputError for other texts."""
-        form = rf"({'|'.join(_BOARDS)}):(\d{{1,3}})x(\d{{1,3}})(?::([\d.]{{1,9}})mm)?(?::first=(\d{{1,4}}))?"
-        parts = re.fullmatch(form, text)
+        side, first = r"(?::(\d{1,4}(?:\.\d{1,6})?)mm)?", r"(?::first=(\d{1,4}))?"
+        parts = re.fullmatch(rf"({'|'.join(_BOARDS)}):(\d{{1,3}})x(\d{{1,3}}){side}{first}", text)
         if parts is None or min(int(parts[2]), int(parts[3])) < LEAST_ROWS:
             raise InputError(
                 f"--board {text}: write kind:columnsxrows, of {LEAST_ROWS} or more, such as chessboard:9x7 "
@@ -503,7 +503,10 @@ class Board(NamedTuple):
             )
         if parts[5] and parts[1] != "charuco":
             raise InputError(f"--board {text}: a {parts[1]} has no tags: leave out first={parts[5]}")
-        return cls(parts[1], int(parts[3]), int(parts[2]), int(parts[5] or 0), _millimetres(text, parts[4]))
+        pitch_mm = None if parts[4] is None else float(parts[4])
+        if pitch_mm == 0.0:
+            raise InputError(f"--board {text}: {parts[4]}mm is no side of a square: write such as 25mm")
+        return cls(parts[1], int(parts[3]), int(parts[2]), int(parts[5] or 0), pitch_mm)
 
     def __str__(self) -> str:
         """Kind, columns, rows, the side of a square if it is stated, and the first tag unless it is 0."""
@@ -526,19 +529,6 @@ class Board(NamedTuple):
     def grid_points(self) -> FloatArray:
         """Places (N, 2) of the corners on the board, in squares."""
         return np.indices(self.shape)[::-1].reshape(2, -1).T.astype(np.float64)
-
-
-def _millimetres(text: str, number: str | None) -> float | None:
-    """Side of a square, mm, None without one. Raises InputError if it is none."""
-    if number is None:
-        return None
-    try:
-        side = float(number)
-    except ValueError:
-        side = 0.0
-    if not side > 0.0:
-        raise InputError(f"--board {text}: {number}mm is no side of a square: write such as 25mm")
-    return side
 
 
 class BoardFinder(Finder):

@@ -76,8 +76,7 @@ def pair_images(sources: Mapping[str, str], joints: JointList, where: str) -> Im
 
     sources : by the name of each view, a folder, or a pattern such as ``left/*.png``.
     joints : the poses. Images are found by their names in the list, otherwise by the pose number at the end
-    of
-        their names, or in the order of their names.
+        of their names, or in the order of their names.
     where : file of the poses, for messages.
     Raises InputError if there are no images, or the image of a pose is missing or ambiguous.
     """

@@ -269,7 +269,8 @@ def base_frame(
         or that is the origin without such an axis.
     Raises InputError if this point is needed and not known.
     """
-    d, z = directions(axes, prismatic), directions(axes, prismatic)[..., 0, :]
+    d = directions(axes, prismatic)
+    z = d[..., 0, :]
     origin = _origin(axes, joints, near)
     if joints.x is not None:
         return _frame(np.cross(z, d[..., joints.x, :]), z, origin)
@@ -402,11 +403,9 @@ def _bodies(models: ProjectiveParameters, c: Calibration, face: Sequence[int]) -
     axes[:, c.prismatic, :3] = 0.0
     near, eye = None, None
     if c.boards is not None:
-        middle, eye = homogeneous(M[:, [*face]].mean(axis=1)), _centers(models.P[:, 0] @ back)
-        near, eye = (
-            (to_zero @ point[..., None])[:, :3, 0] if moves else point[:, :3]
-            for point, moves in ((middle, c.mount != TOOL), (eye, True))
-        )
+        middle, center = homogeneous(M[:, [*face]].mean(axis=1)), _centers(models.P[:, 0] @ back)
+        eye = _moved(to_zero, center)
+        near = middle[:, :3] if c.mount == TOOL else _moved(to_zero, middle)
     base = base_frame(axes, c.prismatic, base_joints(axes[0], c.prismatic), near)
     inverse = rigid_inverse(base)
     # The frame on the last link, at the reference.
@@ -442,6 +441,11 @@ def _bodies_by_flange(models: ProjectiveParameters, c: Calibration, chart: Flang
     B = len(P)
     axes = np.broadcast_to(screws(chart.H_hat), (B, 6, 6)).copy()
     return MetricParameters(P, models.lens, axes, np.broadcast_to(chart.T, (B, 4, 4)).copy(), markers)
+
+
+def _moved(T: FloatArray, points: FloatArray) -> FloatArray:
+    """Points (B, 3) of homogeneous ones (B, 4) after displacements (B, 4, 4)."""
+    return np.asarray((T @ points[..., None])[:, :3, 0])
 
 
 def _centers(P: FloatArray) -> FloatArray:

@@ -11,28 +11,12 @@ import numpy as np
 from projservo_cli.geometry.flange import FlangeChart, require_poses
 from projservo_cli.records import FloatArray, InputError, WorkFailed
 
-FLANGE = "flange"
-"""Readings of a class that takes poses of the flange."""
+# Value of ``readings`` of a class that takes poses.
+_FLANGE = "flange"
 
 
 class PoseRefused(Exception):  # noqa: N818  # a controller's answer and no error of a program
     """A controller refuses a pose, which its words explain."""
-
-
-def takes_poses(robot: Any) -> bool:
-    """Whether a robot, or the class of one, reads and takes poses of the flange."""
-    return getattr(robot, "readings", "joints") == FLANGE
-
-
-def require_readings(robot: Any, name: str, chart: FloatArray | None) -> None:
-    """Refuse a robot of joints where the configuration has poses of the flange, or the reverse."""
-    if takes_poses(robot) and chart is None:
-        raise InputError(f'{name}: takes poses of the flange (readings = "flange"): set robot.flange')
-    if chart is not None and not takes_poses(robot):
-        raise InputError(
-            f"{name}: takes joints, and robot.flange is of a class with readings = 'flange': leave it out, "
-            "or let the class take poses"
-        )
 
 
 class FlangeRobot:
@@ -65,12 +49,12 @@ class FlangeRobot:
         The twist (6,) is the velocity of the flange, m/s, then its angular velocity, rad/s.
         Raises WorkFailed, in the words of the controller, if it refuses the pose.
         """
-        R = self._chart.poses(target[None])[0]
+        T = self._chart.poses(target[None])[0]
         rates = self._chart.turn_axes(target) @ speed[3:]
         try:
-            self._robot.command(R, np.concatenate([speed[:3], rates]), due)
+            self._robot.command(T, np.concatenate([speed[:3], rates]), due)
         except PoseRefused as refusal:
-            at = ", ".join(f"{1e3 * value:.0f}" for value in R[:3, 3])
+            at = ", ".join(f"{1e3 * value:.0f}" for value in T[:3, 3])
             raise WorkFailed(f"the controller refused the pose at ({at}) mm: {refusal}") from refusal
 
     def _coordinates(self, pose: Any) -> FloatArray:
@@ -94,7 +78,14 @@ def by_joints(robot: _Robot, name: str, chart: FloatArray | None) -> _Robot:
 
     Raises InputError if one is of joints and the other of poses.
     """
-    require_readings(robot, name, chart)
+    takes_poses = getattr(robot, "readings", "joints") == _FLANGE
     if chart is None:
+        if takes_poses:
+            raise InputError(f'{name}: takes poses of the flange (readings = "flange"): set robot.flange')
         return robot
+    if not takes_poses:
+        raise InputError(
+            f"{name}: takes joints, and robot.flange is of a class with readings = 'flange': leave it out, "
+            "or let the class take poses"
+        )
     return cast(_Robot, FlangeRobot(robot, FlangeChart.from_record(chart)))

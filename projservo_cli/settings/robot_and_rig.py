@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator
+from functools import lru_cache
 from typing import Annotated, Literal
 
 import numpy as np
@@ -147,32 +148,33 @@ class FlangeSettings(Section):
         home = np.array(self.home)
         return FlangeChart(home[:3, :3], home)
 
-    @property
-    def screws(self) -> _Screws:
-        """Its readings as joints of an arm."""
-        place = np.array(self.home)[:3, 3]
-        slides = ((np.array(self.box_mm) / MM - place[:, None]) + 0.0).tolist()
-        turns = [[-turn, turn] for turn in (self.max_tilt_deg, self.max_tilt_deg, self.max_spin_deg)]
-        joints = [
-            {"type": kind, "name": name, "w": w.tolist(), "v": v.tolist(), unit: limits}
-            for kind, name, (w, v), unit, limits in zip(
-                FLANGE_TYPES,
-                ("x", "y", "z", "tilt about x", "tilt about y", "spin"),
-                screws(self.chart.H_hat).reshape(6, 2, 3),
-                ["limits_m"] * 3 + ["limits_deg"] * 3,
-                slides + turns,
-                strict=True,
-            )
-        ]
-        reference = {"joints": [0.0] * 6, "unit": "rad"}
-        return _Screws.model_validate({"reference": reference, "base_tool": self.home, "joints": joints})
-
     def contradictions(self) -> Iterator[Note]:
         """A home outside the box."""
         for i, (low, high) in enumerate(self.box_mm):
             if not low < MM * self.home[i][3] < high:
                 at = f"home has {'xyz'[i]} {MM * self.home[i][3]:g} mm"
                 yield ("box_mm",), f"{at}, which is not between {low:g} and {high:g}"
+
+
+@lru_cache(maxsize=32)  # asked for wherever the joints of a robot are
+def _screws_of(flange: FlangeSettings) -> _Screws:
+    """Readings of poses of the flange as joints of an arm."""
+    place = np.array(flange.home)[:3, 3]
+    slides = ((np.array(flange.box_mm) / MM - place[:, None]) + 0.0).tolist()
+    turns = [[-turn, turn] for turn in (flange.max_tilt_deg, flange.max_tilt_deg, flange.max_spin_deg)]
+    joints = [
+        {"type": kind, "name": name, "w": w.tolist(), "v": v.tolist(), unit: limits}
+        for kind, name, (w, v), unit, limits in zip(
+            FLANGE_TYPES,
+            ("x", "y", "z", "tilt about x", "tilt about y", "spin"),
+            screws(flange.chart.H_hat).reshape(6, 2, 3),
+            ["limits_m"] * 3 + ["limits_deg"] * 3,
+            slides + turns,
+            strict=True,
+        )
+    ]
+    reference = {"joints": [0.0] * 6, "unit": "rad"}
+    return _Screws.model_validate({"reference": reference, "base_tool": flange.home, "joints": joints})
 
 
 class LimitSettings(OneOf):
@@ -233,7 +235,7 @@ class RobotSettings(Section):
     @property
     def twists(self) -> _Screws | None:
         """Joint screws, as given or of poses of the flange."""
-        return self.screws if self.flange is None else self.flange.screws
+        return self.screws if self.flange is None else _screws_of(self.flange)
 
     @property
     def joint_types(self) -> str:

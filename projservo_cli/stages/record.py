@@ -242,8 +242,8 @@ def new_recording(
                 raise InputError(f"motions: pose {pose}: {messages.sentence(wrong)}: choose another")
         targets = np.vstack([targets, motions.q])
     numbers = np.array(inputs.numbers, dtype=np.int64)
-    recording = _Recording(path or Path(), key, targets, numbers, mount=inputs.mount)
-    recording = replace(recording, flange_chart=inputs.trials.joints.flange_chart)
+    chart = inputs.trials.joints.flange_chart
+    recording = _Recording(path or Path(), key, targets, numbers, mount=inputs.mount, flange_chart=chart)
     if path is None:
         return recording
     if path.exists() and force:

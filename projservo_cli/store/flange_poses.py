@@ -81,8 +81,10 @@ def coordinates_of(
 
     Raises InputError where the calibration is by joints.
     """
-    own = given if like is None else like.flange_chart
-    chart = FlangeChart.of(T) if like is None and given is None else FlangeChart.from_optional(own)
+    if like is None:
+        own = FlangeChart.from_optional(given) or FlangeChart.of(T)
+        return own.coordinates(T), own.record
+    chart = FlangeChart.from_optional(like.flange_chart)
     if chart is None:
         raise InputError(
             f"{where}: these rows are poses of the flange, and the calibration is by joint readings: give "
