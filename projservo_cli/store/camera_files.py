@@ -12,8 +12,9 @@ from projservo_cli.geometry.lens import distort
 from projservo_cli.metric.opencv import opencv_terms
 from projservo_cli.records import FloatArray, InputError
 
-# Points along a side of the image at which a lens is fitted, and its maximum rms error, px.
-_GRID, _MAX_OFF_PX = 17, 0.3
+# A lens is fitted over the raw image, which one that bends inwards fills from beyond the image of a pinhole:
+# by how much on each side, in sides; points along one, radii to find a fold, and maximum rms error, px.
+_BEYOND, _GRID, _RADII, _MAX_OFF_PX = 0.5, 41, 400, 0.3
 _MODELS = {
     "plumb_bob": "plumb_bob",
     "rational_polynomial": "plumb_bob",
@@ -117,13 +118,15 @@ def _nearest_lens(
     lens = np.array([K[0, 2], K[1, 2], radius, 0.0, 0.0])
     if not coefficients.any() and model != "fisheye":
         return lens, 0.0
-    # Points of the scene whose images fill the raw image, where the lens bends inwards.
-    straight = np.stack(np.meshgrid(*(np.linspace(0.0, side, _GRID) for side in extent)), axis=-1).reshape(
-        -1, 2
-    )
+    sides = (np.linspace(-_BEYOND * side, (1.0 + _BEYOND) * side, _GRID) for side in extent)
+    straight = np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 2)
     x = (straight - K[:2, 2]) / np.diag(K)[:2]
     seen = _distorted(K, coefficients, model, x)
-    within = ((seen >= 0.0) & (seen <= extent)).all(axis=1)
+    # Beyond a fold, points far off would be seen a second time.
+    r = np.linspace(0.0, np.linalg.norm(x, axis=1).max(), _RADII)
+    back = np.diff(_distorted(K, coefficients, model, np.stack([r, 0.0 * r], axis=1))[:, 0]) <= 0.0
+    fold = r[np.argmax(back)] if back.any() else np.inf
+    within = ((seen >= 0.0) & (seen <= extent)).all(axis=1) & (np.linalg.norm(x, axis=1) < fold)
     straight, seen = straight[within], seen[within]
     free = [0, 1, 3, 4]
 

@@ -91,6 +91,7 @@ def test_a_known_lens_is_taken_and_another_camera_is_named(projservo, monkeypatc
     [
         ("thin_prism", np.zeros(5), "distortion_model thin_prism"),
         ("plumb_bob", np.array([-0.2, 0.05, 0.01, 0.01, 0.0]), "miss its lens"),
+        ("plumb_bob", np.array([-0.35, 0.15, 0.0, 0.0, -0.03]), "miss its lens"),  # at the borders alone
         ("fisheye", np.array([-0.01, 0.003, -0.002, 0.0004]), "miss its lens"),
     ],
 )
