@@ -34,14 +34,13 @@ from projservo_cli.records import Calibration, FloatArray, InputError, JointList
 from projservo_cli.result_hashes import File
 from projservo_cli.results import ImageModel, MotionPlan, RunTrace
 from projservo_cli.settings.calibration_and_refits import CalibrationSettings
-from projservo_cli.settings.noise_and_data import Data
+from projservo_cli.settings.sections import Positive
 from projservo_cli.stages import Progress
 from projservo_cli.stages import calibrate as calibrating
 from projservo_cli.stages import plan as planning
 from projservo_cli.stages import record as recording
 from projservo_cli.stages import servo as driving
 from projservo_cli.stages.stage_inputs import Estimation, RefitInputs, Trials
-from projservo_cli.stages.worlds.external_robot import plugin_robot
 from projservo_cli.store.display import checked_array, numbers_in, require_radians
 from projservo_cli.store.files_and_locks import working_in, writing
 from projservo_cli.store.run_file import load as stored_run
@@ -161,14 +160,7 @@ def record(
         made = recording.new_recording(given, table, motions=further, force=force)
         if not (made.pending or asked.plant.simulated):
             listener.say(f"record: {table} is up to date, and the robot is not moved: use force=True")
-        driven = None
-        if robot is not None:
-            assert given.trials.driven is not None
-            assert given.own is not None
-            how = given.trials.driven
-            bounds, numbers = how.following.bounds(joints), made.marker.tolist()
-            driven = plugin_robot(given.own, bounds, joints.types, numbers, robot, further=how.further)
-        recording.record_poses(given, made, driven, kept=table is not None, progress=listener.progress)
+        recording.record_poses(given, made, given=robot, kept=table is not None, progress=listener.progress)
     return Observations.of(
         made.observation(),
         joint_types=asked.joint_types,
@@ -178,10 +170,10 @@ def record(
     )
 
 
-class _CalibrationArguments(CalibrationSettings, Data):
-    """Arguments of ``calibrate``, each a key of the section that it belongs to, of observations at hand."""
+class _CalibrationArguments(CalibrationSettings):
+    """Arguments of ``calibrate``, which are keys of its section, and the noise of observations at hand."""
 
-    table: str = ""
+    noise_px: Positive | None = None
 
 
 def calibrate(
@@ -251,13 +243,13 @@ def calibrate(
         "seed": seed,
     }
     settings = checked_values("calibrate", _CalibrationArguments, given)
-    seen = observations
-    if settings.joint_noise_deg is not None:
-        seen = replace(seen, joint_noise=float(np.radians(settings.joint_noise_deg)))
+    noise = observations.noise
+    if settings.joint_noise is not None:
+        noise = noise._replace(joint=settings.joint_noise)
     if settings.noise_px is not None:
-        seen = replace(seen, noise_px=settings.noise_px)
-    if settings.seed is not None:
-        seen = replace(seen, seed=settings.seed)
+        noise = noise._replace(px=settings.noise_px)
+    seed = observations.seed if settings.seed is None else settings.seed
+    seen = replace(observations, noise=noise, seed=seed)
     start = None if settings.init is None else str(Path(settings.init).resolve())
     file = None if start is None else File.of(start, "JSON with screws, cameras and markers")
     asked = Estimation(

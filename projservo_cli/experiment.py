@@ -139,8 +139,8 @@ class Experiment(Printed):
             chain.make()
         finally:
             self._run = chain.run
-        if chain.failed:
-            raise WorkFailed(f"{chain.failed}: {chain.reason}")
+        if chain.failure.step:
+            raise WorkFailed(f"{chain.failure.step}: {chain.failure.reason}")
         return self
 
     @property

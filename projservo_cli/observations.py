@@ -4,7 +4,7 @@ import dataclasses
 import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -25,6 +25,14 @@ from projservo_cli.store.observation_tables import (
 )
 
 
+class KnownNoise(NamedTuple):
+    """What is known of the noise of observations."""
+
+    px: float | None = None  # standard deviation of a coordinate; None to estimate it
+    joint: float | None = None  # rms of readings less true joints, rad; None to estimate it
+    alone: bool = False  # whether pixel noise is the only error
+
+
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Observations(Displayable, Observation):
     """Images of markers at a sequence of poses, and their properties.
@@ -39,10 +47,8 @@ class Observations(Displayable, Observation):
     moving, t_q, t_view, sigma : as in [the run file]; None where unknown.
     joint_types : one letter a joint, R or P.
     image_size : width and height, px, of all images or of one each; None where unknown.
-    noise_px : standard deviation of a coordinate, px; None to estimate it.
-    joint_noise : rms of joint readings less true joints, rad (prismatic × 0.3 m/rad); None to estimate it.
+    noise : what is known of it: ``noise_px``, ``joint_noise`` and ``exact`` are its fields too.
     source : ``simulated`` or ``recorded``.
-    exact : whether pixel noise is their only error, so that χ² decides against ``noise_px``.
     seed : seed of the random starts of a calibration.
     mount : ``world`` for cameras that watch the tool, ``tool`` for cameras on it.
     order_stated : whether the order of the joints along the arm is known to be the order of q.
@@ -50,13 +56,26 @@ class Observations(Displayable, Observation):
 
     joint_types: str = ""
     image_size: ImageSize | None = None
-    noise_px: float | None = None
-    joint_noise: float | None = None
+    noise: KnownNoise = dataclasses.field(default_factory=KnownNoise)
     source: str = "recorded"
-    exact: bool = False
     seed: int = 0
     mount: str = WORLD
     order_stated: bool = False
+
+    @property
+    def noise_px(self) -> float | None:
+        """Standard deviation of a coordinate, px; None to estimate it."""
+        return self.noise.px
+
+    @property
+    def joint_noise(self) -> float | None:
+        """Rms of joint readings less true joints, rad (prismatic × 0.3 m/rad); None to estimate it."""
+        return self.noise.joint
+
+    @property
+    def exact(self) -> bool:
+        """Whether pixel noise is their only error, so that χ² decides against ``noise_px``."""
+        return self.noise.alone
 
     def __post_init__(self) -> None:
         """Refuse an image size or a noise that is none."""
@@ -162,8 +181,8 @@ class Observations(Displayable, Observation):
             view=names,
             flange_chart=None if chart is None else chart.record,
         )
-        known = {"joint_types": types, "image_size": image_size, "noise_px": noise_px, "mount": mount}
-        return cls.of(record, **known)
+        noise = KnownNoise(noise_px)
+        return cls.of(record, joint_types=types, image_size=image_size, noise=noise, mount=mount)
 
     @classmethod
     def from_frame(
@@ -197,8 +216,8 @@ class Observations(Displayable, Observation):
             text = _text_of(table)
             observation = read_table("table", types, joint_unit, frame=text)
             mount = mount_in("table", text)
-        known = {"joint_types": types, "image_size": image_size, "noise_px": noise_px, "mount": mount}
-        return cls.of(observation, **known)
+        noise = KnownNoise(noise_px)
+        return cls.of(observation, joint_types=types, image_size=image_size, noise=noise, mount=mount)
 
     @classmethod
     def concat(cls, parts: Sequence["Observations"]) -> "Observations":

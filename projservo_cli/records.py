@@ -1047,7 +1047,7 @@ class CarriedByObject(RecordPart):
     s_object: FloatArray = _array(
         "view object_marker xy", "px", "images of these when it was planned, NaN if unseen"
     )
-    s_object_taught: FloatArray | None = _optional_array(
+    s_object_taught: FloatArray = _array(
         "view object_marker xy", "px", "images of these when the goal was taught, NaN if unseen"
     )
     sigma_object: FloatArray | None = _optional_array(

@@ -62,6 +62,8 @@ _ADDED: dict[str, dict[str, Any]] = {
     "Markers": {"boards": None},
     **{name: {"flange_chart": None} for name in ("JointSettings", "OwnRobot", "Table")},
 }
+# Records whose fields count as those of the record that holds them, as they did at first.
+_PARTS = ("Described", "ToolMarkers")
 _KINDS = {
     name: f"projservo_cli.{module}:{name}"
     for module, names in _FIRST_MODULES.items()
@@ -112,7 +114,11 @@ def encoded(record: Any) -> bytes:
 def _fields(record: Any) -> dict[str, Any]:
     """Values of a dataclass, a named tuple or a section by their names; none of other values."""
     if dataclasses.is_dataclass(record):
-        return {field.name: getattr(record, field.name) for field in dataclasses.fields(record)}
+        found = dict[str, Any]()
+        for name in (field.name for field in dataclasses.fields(record)):
+            value = getattr(record, name)
+            found |= _fields(value) if type(value).__name__ in _PARTS else {name: value}
+        return found
     if hasattr(type(record), "model_fields"):
         return dict(record)  # with keys that are names of views
     return {name: getattr(record, name) for name in getattr(record, "_fields", ())}

@@ -60,7 +60,7 @@ def servo_inputs(config):
 def scenario_of(config, calibration=None):
     """The scenario of the runs of a configuration, by a calibration or by one without errors."""
     inputs = servo_inputs(config)
-    return scenario.run_scenario(inputs, calibration or inputs.plan.truth.calibration)
+    return scenario.run_scenario(inputs, calibration or inputs.plan.described.truth.calibration)
 
 
 def under(scenario, config, **more):

@@ -280,8 +280,7 @@ class _Search:
 
     def pruned(self, found: Solution, chosen: Sequence[Hypothesis]) -> Solution:
         """Fit without terms of hypotheses of all joints that differ from zero by chance, or bend too far."""
-        curve, deviation = found.params.curve, _deviations(found)
-        assert curve is not None
+        curve, deviation = found.params.curve or NO_CURVE, _deviations(found)
         size, groups = np.abs(curve.terms[:, 3]), [one for one in chosen if not one.joints]
         weak = (size < _APART * deviation) | ((curve.terms[:, 0] == BASIS.index("torque")) & (size > _BENDS))
         own = {key for keys in _terms(groups, found).values() for key in keys}
@@ -291,8 +290,8 @@ class _Search:
 
     def require_known(self, found: Solution, chosen: Sequence[Hypothesis]) -> None:
         """Refuse a curve with a term that the data leave open, by the motion of its joint in its range."""
-        curve, params, problem = found.params.curve, found.params, found.problem
-        assert curve is not None
+        params, problem = found.params, found.problem
+        curve = params.curve or NO_CURVE
         deviation = _deviations(found)
         max_gain = np.abs(basis(curve, params.prismatic, problem.q)).max(axis=0)
         joint = curve.terms[:, 1].astype(int)

@@ -29,6 +29,14 @@ from projservo_cli.store.run_file import SERVO, Run, save
 FIGURES = "figures"  # folder of a run in which a killed report may have left something
 
 
+class Failure(NamedTuple):
+    """The step that failed, and why."""
+
+    step: str = ""  # its name; empty for none
+    reason: str = ""
+    evidence: tuple[Finding, ...] = ()  # the reason as data
+
+
 class _Shortfall(NamedTuple):
     """A failure in words, and whether a call fails by it."""
 
@@ -53,9 +61,7 @@ class Chain:
     blind: bool = False  # whether a robot may move although cameras show nothing
     steps: list[Step] = field(init=False)
     laws: tuple[str, ...] = field(init=False)  # names of the runs of laws that the steps make or need
-    failed: str = ""  # name of the step that failed
-    reason: str = ""  # why
-    evidence: tuple[Finding, ...] = ()  # likewise, as data
+    failure: Failure = field(default_factory=Failure)
     laws_done: tuple[str, ...] = ()
     robot: Steps = field(init=False)  # on which steps of the task are made
     table: Observations | None = None  # of the calibration to be made, once it is read
@@ -86,7 +92,7 @@ class Chain:
     def lacks(self, stage: str) -> bool:
         """Whether a stage was not completed."""
         order = [step.stage for step in self.steps]
-        return bool(self.failed) and order.index(stage) >= order.index(self.failed.split("/")[0])
+        return bool(self.failure.step) and order.index(stage) >= order.index(self.failure.step.split("/")[0])
 
     def require_permitted(self, named: Collection[str]) -> None:
         """Refuse to move a robot that no stage asks for, or to start code that only a stored run names.
@@ -152,7 +158,7 @@ class Chain:
 
     def make(self) -> None:
         """Make the outdated results, stop at the first failure, keep finished results."""
-        if self.failed:
+        if self.failure.step:
             return
         for one in self.replayed():
             self.listener.say("{law}: the stored run of {plant}, recorded {date}".format_map(one))
@@ -164,7 +170,7 @@ class Chain:
                 self._make_steps(steps)
         except WorkFailed as error:  # the robot may not be at rest
             self._fail(steps[-1], error)
-        if self.failed:
+        if self.failure.step:
             return
         text = stored_yaml(self.config)
         if self.run.configuration != text:  # overrides are stored also if nothing had to be made
@@ -187,7 +193,7 @@ class Chain:
                     what = "refused" if isinstance(error, InputError) else "interrupted"
                     self.listener.say(f"{step.name}: {what}{self.robot.left_behind(step.part)}")
                 raise
-            if step.law and not self.failed:
+            if step.law and not self.failure.step:
                 name = step.name.removeprefix(SERVO)
                 self.laws_done += (name,)
                 trace = self.run.traces[name]
@@ -197,7 +203,7 @@ class Chain:
                     self._fail(step, f"ended in {trace.verdict}: {trace.reason}")
                 elif self.robot.session is not None and (lost := self.robot.session.lost):
                     self._fail(step, failed([lost]))
-            if self.failed:
+            if self.failure.step:
                 return
 
     def _may_move(self, motion: Step, steps: Sequence[Step]) -> bool:
@@ -237,8 +243,8 @@ class Chain:
     def _fail(self, step: Step, why: str | WorkFailed) -> None:
         """Note the failure of a step, of a sequence with the states that stay as sent."""
         after = self.robot.left_behind(step.part) if step.part and step.stage == "servo" else ""
-        self.failed, self.reason = step.name, " ".join(str(why).split()) + after
-        self.evidence = why.findings if isinstance(why, WorkFailed) else ()
+        evidence = why.findings if isinstance(why, WorkFailed) else ()
+        self.failure = Failure(step.name, " ".join(str(why).split()) + after, evidence)
 
     def reported(self, run: Run | None = None) -> Run:
         """Return the results that a report of the named runs of laws needs.
@@ -254,7 +260,7 @@ class Chain:
         if self.recording.why:
             self.listener.say(f"record: making ({self.recording.why})")
         if why := recording_made(self.listener, self.config, self.recording, confirm=self.confirm):
-            self.failed, self.reason, self.evidence = "record", str(why), why.findings
+            self.failure = Failure("record", str(why), why.findings)
             return False
         if self.run.refuted:  # by the recording that the new one has replaced
             save(replace(self.run, refuted=""))
@@ -301,9 +307,9 @@ class Chain:
 
         of_calibration : whether joint types were assumed, and the results of suggestions.
         """
-        if self.failed:
+        if self.failure.step:
             yield from self._of_runs()
-            yield _Shortfall(f"{self.failed}: {self.reason}", fatal=True)
+            yield _Shortfall(f"{self.failure.step}: {self.failure.reason}", fatal=True)
             return
         results = self.run.results
         if "calibrate" in results and not self.run.calibration.usable:
@@ -325,7 +331,7 @@ class Chain:
     def _of_runs(self) -> Iterator[_Shortfall]:
         """A line on each run that did not converge or missed periods, and whether the call fails by it."""
         required = self.config.control.must_converge
-        failed = self.failed.removeprefix(SERVO)  # is printed last
+        failed = self.failure.step.removeprefix(SERVO)  # is printed last
         for trace in (self.run.traces[law] for law in self.laws_done if law != failed):
             must, converged = must_converge(trace.law, required), arrived(trace.verdict)
             if meaning(trace.verdict).ends or (converged and not trace.overruns):
@@ -354,7 +360,7 @@ class Chain:
         except WorkFailed as error:
             self._fail(step, error)
             if error.refutes:
-                self._keep(replace(self.run, refuted=self.reason))
+                self._keep(replace(self.run, refuted=self.failure.reason))
             return
         place, run = STAGES.index(step.stage), replace(self.run, configuration=run.configuration)
         after = [name for name in run.results if STAGES.index(name.split("/")[0]) > place]

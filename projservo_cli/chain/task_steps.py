@@ -50,10 +50,12 @@ class Steps:
         assert self.session is not None
         assert inputs.contract is not None
         joints = inputs.plan.joints.joints(c.joint_types, c)
-        opened_robot(self.session, inputs.contract.driven, joints, observed_numbers(inputs.plan, c), c.view)
+        steered = opened_robot(
+            self.session, inputs.contract.driven, joints, observed_numbers(inputs.plan, c), c.view
+        )
         actions = {name for step in self.config.steps.values() for name in step.act or ()}
         self.session.require_acts(actions)  # refuses actions that the robot lacks
-        return self.session.reading()
+        return steered.robot.read().q
 
     def joints_before(self, c: Calibration) -> FloatArray:
         """Joints (n,) of the arm before any motion, rad or m."""
@@ -85,8 +87,8 @@ class Steps:
         from projservo_cli.stages import plan as planning
 
         k, q = self.motions.index(step.part), plan.q_start
-        if k and self.session is not None and self.session.robot is not None:
-            q = self.session.reading()
+        if k and self.session is not None and (robot := self.session.robot) is not None:
+            q = robot.read().q
         elif k:
             q = run.traces[f"{self.motions[k - 1]}/{step.law}"].q[-1]
         inputs = replace(inputs, plan=replace(inputs.plan, q_current=q))

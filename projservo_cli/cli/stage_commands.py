@@ -532,14 +532,14 @@ def _work(console: Console, chain: "Chain", options: Mapping[str, Any]) -> int:
     from projservo_cli.records import WorkFailed
     from projservo_cli.report.json_objects import failed_object, stage_object
 
-    values, joints = {}, chain.config.joint_names
+    values, joints, failure = {}, chain.config.joint_names, chain.failure
     for name in chain.names:
         if name == "record":
-            short = WorkFailed(chain.reason, findings=chain.evidence) if chain.lacks(name) else None
+            short = WorkFailed(failure.reason, findings=failure.evidence) if chain.lacks(name) else None
             values[name] = {"run": chain.run.path.resolve()} | _recording_object(chain.recording, short)
         elif chain.lacks(name):
-            why = chain.reason, chain.evidence
-            values[name] = failed_object(name, chain.run, why, chain.failed, chain.laws_done)
+            why = failure.reason, failure.evidence
+            values[name] = failed_object(name, chain.run, why, failure.step, chain.laws_done)
         else:
             values[name] = stage_object(name, chain.run, joints, chain.laws)
             values[name] |= more_values.get(name, {})

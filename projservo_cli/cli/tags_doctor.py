@@ -250,7 +250,7 @@ def _watch(console: Console, settings: "Config", robot: "PluginRobot") -> None:
             s = robot.read().s
             frames = () if robot.frames is None else robot.frames
             for name, grey, pixels, goal in zip(robot.view, frames, s, goals, strict=False):
-                live.pictures[name] = annotated(grey, settings.markers.known or (), pixels, goal)
+                live.pictures[name] = annotated(grey, settings.markers.known, pixels, goal)
             time.sleep(robot.bounds.period)
     except KeyboardInterrupt:
         console.say("watch: ended")

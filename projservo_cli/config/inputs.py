@@ -38,6 +38,7 @@ from projservo_cli.stages.stage_inputs import (
     CalibrationInputs,
     CarryingObject,
     Contract,
+    Described,
     Drive,
     Estimation,
     Following,
@@ -55,6 +56,7 @@ from projservo_cli.stages.stage_inputs import (
     SuggestionInputs,
     Table,
     TeachInputs,
+    ToolMarkers,
     Trials,
 )
 from projservo_cli.store.display import About
@@ -165,7 +167,7 @@ def _markers(config: Config) -> Markers:
 
 def _numbers(config: Config, command: str) -> tuple[int, ...]:
     """Numbers of the markers that a robot observes. Raises InputError if they are unknown."""
-    if (numbers := _markers(config).known) is None:
+    if not (numbers := _markers(config).known):
         raise InputError(f"{command} needs to know which markers the robot observes: set markers.numbers")
     return numbers
 
@@ -207,15 +209,19 @@ def plan_inputs(config: Config, files: Files | None = None, *, predicted: bool =
     return PlanInputs(
         task=config.task,
         seed=config.seed,
-        truth=truth_of(config) if simulated else None,
-        arm=None if config.arm is None else arm_of(config.arm),
-        P=None if config.rig is None else cameras_of(config.rig),
-        mount=config.mount,
-        scene=scene_of(config, files, config.objects.named) if simulated else None,
-        face=face,
-        center=center_in_face(markers),
-        known=markers.known,
-        tags=tuple(tag.numbers for tag in markers.all_tags),
+        described=Described(
+            truth_of(config) if simulated else None,
+            None if config.arm is None else arm_of(config.arm),
+            None if config.rig is None else cameras_of(config.rig),
+            config.mount,
+            scene_of(config, files, config.objects.named) if simulated else None,
+        ),
+        markers=ToolMarkers(
+            face,
+            center_in_face(markers),
+            markers.known or None,
+            tuple(tag.numbers for tag in markers.all_tags),
+        ),
         joints=joints_of(config),
         image_size=config.image_size_px,
         noise=config.noise.part(LoopNoise),
@@ -328,9 +334,9 @@ def _contract(config: Config, plan: PlanInputs, files: Files | None) -> Contract
     plant = config.plant
     if plant.use is None and config.disturbance == Disturbance():
         return None
-    driven = _drive(config, plan.truth, files, shows=True)
-    settle_s = plant.settle_s if plan.truth is None else None
-    table = config.data.table if config.data is not None and plan.truth is None else ""
+    driven = _drive(config, plan.described.truth, files, shows=True)
+    settle_s = plant.settle_s if plan.described.truth is None else None
+    table = config.data.table if config.data is not None and plan.described.truth is None else ""
     identity = identity_in(table) if table and Path(table).is_file() else ""
     return Contract(
         driven, config.disturbance.part(Events), plant.timeout_s, plant.time_offset_s, settle_s, identity
@@ -354,7 +360,7 @@ def report_inputs(config: Config, files: Files | None = None) -> ReportInputs:
 def _known_lengths(config: Config) -> KnownLengths:
     """Return the lengths on the tool that the configuration knows."""
     markers = _markers(config)
-    numbers = markers.known or ()
+    numbers = markers.known
     side = markers.tag_size_m if markers.points is None else None
     return KnownLengths(numbers, markers.lengths(numbers), side, markers.front or ())
 

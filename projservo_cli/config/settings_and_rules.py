@@ -184,7 +184,7 @@ def _objects(
     if objects.named and TOOL in (rig and rig.mount, data and data.mount):
         yield ("objects",), "cameras on the tool see the scene that the goal is on: its images carry the goal"
     for name, one in objects.named.items():
-        for number in (n for n in one.numbers if markers is not None and n in (markers.known or ())):
+        for number in (n for n in one.numbers if markers is not None and n in markers.known):
             yield (
                 ("objects", name),
                 f"marker {number} is on the tool: each marker belongs to one object or the tool",

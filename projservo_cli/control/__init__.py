@@ -108,7 +108,13 @@ def _prepared(model: Model, task: Task, gains: Gains, s: FloatArray, state: Stat
     if following(task.reference):
         lead = 1.0 / (gains.gain * gains.period)
         reference_into(
-            model, task.reference, float(state.clock[0]), lead, state.A_ref, state.s_ref, state.q_ahead
+            model,
+            task.reference,
+            float(state.plan.clock[0]),
+            lead,
+            state.plan.A_ref,
+            state.plan.s_ref,
+            state.plan.q_ahead,
         )
     return True, straight
 
@@ -120,7 +126,7 @@ def _finished(task: Task, gains: Gains, q: FloatArray, status: int, limited: boo
     limited : whether the law applies the joint-speed limit.
     """
     if following(task.reference):
-        if status != LOST and on_joint_path(task.reference, float(state.clock[0])):
+        if status != LOST and on_joint_path(task.reference, float(state.plan.clock[0])):
             _keep_near(task.reference, gains, q, status == OK, state)
             status, limited = OK, False
         _go_on(task.reference, gains, status, limited, state)
@@ -136,13 +142,13 @@ def _keep_near(reference: Reference, gains: Gains, q: FloatArray, unique: bool, 
     unique : whether the law found a joint motion; otherwise the joints follow the path alone.
     """
     for i in range(q.shape[0]):
-        step = state.q_ahead[i]
+        step = state.plan.q_ahead[i]
         if unique:
             step += _CORRECTED * (gains.period * state.q_dot[i] - step)
-        q_next = near_joint_path(reference, float(state.clock[0]) + 1.0, i, q[i] + step)
+        q_next = near_joint_path(reference, float(state.plan.clock[0]) + 1.0, i, q[i] + step)
         q_next = min(max(q_next, gains.limits.lower[i]), gains.limits.upper[i])
         state.q_dot[i] = (q_next - q[i]) / gains.period
-    state.parts[0], state.blocked[0] = 0, -1
+    state.step.parts[0], state.step.blocked[0] = 0, -1
 
 
 @merged
@@ -154,5 +160,5 @@ def _go_on(reference: Reference, gains: Gains, status: int, limited: bool, state
     if status != OK:
         return
     if not limited:
-        state.share[0] = limit_speed(state.q_dot, gains.limits.speed)
-    state.clock[0] += reference.rate * state.share[0]
+        state.step.share[0] = limit_speed(state.q_dot, gains.limits.speed)
+    state.plan.clock[0] += reference.rate * state.step.share[0]

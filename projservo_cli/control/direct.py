@@ -62,7 +62,7 @@ def direct(
     if not joint_velocity_into(state):
         return SINGULAR
     for i in range(state.q_dot.shape[0]):
-        state.q_dot[i] += state.q_ahead[i] / gains.period
+        state.q_dot[i] += state.plan.q_ahead[i] / gains.period
     return OK
 
 
@@ -132,14 +132,14 @@ def _first_order(step: _Step, state: State) -> float:
         return math.nan
     largest = 0.0
     for i in range(state.q_dot.shape[0]):
-        state.q_dot[i] += step.ahead * state.q_ahead[i]
+        state.q_dot[i] += step.ahead * state.plan.q_ahead[i]
         largest = max(largest, abs(state.q_dot[i]))
     return largest
 
 
 @internal
 def _continued(model: Model, task: Task, q: FloatArray, step: _Step, settled: float, state: State) -> bool:
-    """Solve the displacement in equal parts, each from the previous one, into ``state.path``.
+    """Solve the displacement in equal parts, each from the previous one, into ``state.step.path``.
 
     The first-order step in ``state.q_dot`` predicts the first part, the previous part the others. A part more
     than twice as long as predicted is on another kinematic branch.
@@ -149,22 +149,22 @@ def _continued(model: Model, task: Task, q: FloatArray, step: _Step, settled: fl
     n, count = q.shape[0], step.pieces
     face = MeasuredFace(state.A, backward(model, q))
     for i in range(n):
-        state.path[0, i] = q[i]
+        state.step.path[0, i] = q[i]
     for j in range(1, count + 1):
         predicted = 0.0
         for i in range(n):
-            part = state.q_dot[i] / count if j == 1 else state.path[j - 1, i] - state.path[j - 2, i]
-            state.path[j, i] = state.path[j - 1, i] + part
+            part = state.q_dot[i] / count if j == 1 else state.step.path[j - 1, i] - state.step.path[j - 2, i]
+            state.step.path[j, i] = state.step.path[j - 1, i] + part
             predicted += part * part
         goal = _desired(step, j / count)
         if following(task.reference) and not follows_joint_path(task.reference):
-            ahead = planned_step(model, task.reference, float(state.clock[0]), step.ahead * j / count)
+            ahead = planned_step(model, task.reference, float(state.plan.clock[0]), step.ahead * j / count)
             goal = mul(ahead, goal)
-        if not reach(model, face, goal, state.path[j], state.work, settled):
+        if not reach(model, face, goal, state.step.path[j], state.work, settled):
             return False
         taken = 0.0
         for i in range(n):
-            part = state.path[j, i] - state.path[j - 1, i]
+            part = state.step.path[j, i] - state.step.path[j - 1, i]
             taken += part * part
         if taken > _BRANCH_FACTOR * _BRANCH_FACTOR * predicted + _ROUND_OFF * _ROUND_OFF:
             return False
@@ -184,7 +184,7 @@ def _solved(model: Model, task: Task, gains: Gains, q: FloatArray, step: _Step, 
     """Solve a displacement in its parts and write its velocity; the share within the limit, 0 if unsolved."""
     if not _continued(model, task, q, step, SETTLED, state):
         return 0.0
-    return _within_speed(gains, q, state.path[step.pieces], gains.period * gains.scale, state)
+    return _within_speed(gains, q, state.step.path[step.pieces], gains.period * gains.scale, state)
 
 
 @merged
@@ -198,7 +198,7 @@ def _blocked_joint(q: FloatArray, q_next: FloatArray, gains: Gains) -> int:
 
 @merged
 def _up_to_limit(model: Model, task: Task, gains: Gains, q: FloatArray, step: _Step, state: State) -> float:
-    """Maximum share of a step, to round-off, within the joint limits; its parts in ``state.path``.
+    """Maximum share of a step, to round-off, within the joint limits; its parts in ``state.step.path``.
 
     By bisection of the displacement along the path, solved for the joints each time.
     """
@@ -208,18 +208,18 @@ def _up_to_limit(model: Model, task: Task, gains: Gains, q: FloatArray, step: _S
         trial = _scaled(step, share + width, step.pieces)
         _first_order(trial, state)
         if _continued(model, task, q, trial, SETTLED, state):
-            joint = _blocked_joint(q, state.path[step.pieces], gains)
+            joint = _blocked_joint(q, state.step.path[step.pieces], gains)
             if joint < 0:
                 share += width
             else:
-                state.blocked[0] = joint
+                state.step.blocked[0] = joint
         width *= 0.5
     last = _scaled(step, share, step.pieces)
     _first_order(last, state)
     if share == 0.0 or not _continued(model, task, q, last, SETTLED, state):
         for j in range(step.pieces + 1):
             for i in range(q.shape[0]):
-                state.path[j, i] = q[i]
+                state.step.path[j, i] = q[i]
         share = 0.0
     return share
 
@@ -250,7 +250,7 @@ def exact(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, 
     whole = _Step(parts=parts, H_s=H_s, tau=tau, theta=theta, sense=sense, ahead=1.0, pieces=1)
     if not math.isfinite(_first_order(whole, state)):
         return SINGULAR
-    if on_joint_path(task.reference, float(state.clock[0])):
+    if on_joint_path(task.reference, float(state.plan.clock[0])):
         for i in range(q.shape[0]):
             state.q_dot[i] /= gains.period
         return OK
@@ -260,7 +260,7 @@ def exact(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, 
         step = _scaled(whole, share * gains.scale, 1)
         _first_order(step, state)
         _continued(model, task, q, step, math.inf, state)
-        left = _within_speed(gains, q, state.path[1], seconds, state)
+        left = _within_speed(gains, q, state.step.path[1], seconds, state)
         if left < 1.0:
             share *= max(_AIM * left, 1.0 / _BRANCH_FACTOR)
     step = _scaled(whole, share * gains.scale, 1)
@@ -282,13 +282,13 @@ def exact(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, 
         _first_order(step, state)
         for i in range(q.shape[0]):
             state.q_dot[i] /= seconds
-        state.share[0], state.parts[0], state.blocked[0] = share, 0, -1
+        state.step.share[0], state.step.parts[0], state.step.blocked[0] = share, 0, -1
         return OK
-    state.blocked[0] = _blocked_joint(q, state.path[count], gains)
-    if state.blocked[0] >= 0:
+    state.step.blocked[0] = _blocked_joint(q, state.step.path[count], gains)
+    if state.step.blocked[0] >= 0:
         step = _scaled(whole, share * gains.scale, count)
         share *= _up_to_limit(model, task, gains, q, step, state)
-        _within_speed(gains, q, state.path[count], seconds, state)
-    state.share[0] = share
-    state.parts[0] = count
+        _within_speed(gains, q, state.step.path[count], seconds, state)
+    state.step.share[0] = share
+    state.step.parts[0] = count
     return OK

@@ -105,6 +105,25 @@ class Law(NamedTuple):
     gains: Gains
 
 
+class StepParts(NamedTuple):
+    """The last step of a law, as it is to be sent."""
+
+    path: FloatArray  # (129, n) joints at the ends of the parts of a step, the current ones first
+    # (1,) share of the amplitude left by the joint-speed limit, −1 if the law leaves the limit to the loop
+    share: FloatArray
+    parts: IntArray  # (1,) number of parts of the step in ``path``; 0 if the joints move linearly to the end
+    blocked: IntArray  # (1,) joint at whose limit the step ends, −1 for none
+
+
+class AlongPlan(NamedTuple):
+    """Where a law is along a plan, and the plan there."""
+
+    clock: FloatArray  # (1,) completed periods of the plan, if there is one
+    A_ref: FloatArray  # (m, 4) points of the face by the plan
+    s_ref: FloatArray  # (V, m, 2) target pixels of the image-based law by the plan
+    q_ahead: FloatArray  # (n,) joint motion of the plan in the next period; zero without a plan
+
+
 class State(NamedTuple):
     """Workspace and results of a law."""
 
@@ -126,16 +145,9 @@ class State(NamedTuple):
     # and view, even if the face is not seen; NaN if it is measured point by point
     face_px: FloatArray
     normal: FloatArray  # (6, 7) workspace of the fit of the body
-    path: FloatArray  # (129, n) joints at the ends of the parts of a step, the current ones first
-    # (1,) share of the amplitude left by the joint-speed limit, −1 if the law leaves the limit to the loop
-    share: FloatArray
-    parts: IntArray  # (1,) number of parts of the step in ``path``; 0 if the joints move linearly to the end
-    blocked: IntArray  # (1,) joint at whose limit the step ends, −1 for none
+    step: StepParts
     straight: FloatArray  # (V, b, 2) undistorted pixels if there is a lens
-    clock: FloatArray  # (1,) completed periods of the plan, if there is one
-    A_ref: FloatArray  # (m, 4) points of the face by the plan
-    s_ref: FloatArray  # (V, m, 2) target pixels of the image-based law by the plan
-    q_ahead: FloatArray  # (n,) joint motion of the plan in the next period; zero without a plan
+    plan: AlongPlan
 
 
 def new_state(n: int, m: int, observed: int = 0, span: Span = OWN, views: int = len(VIEWS)) -> State:
@@ -161,15 +173,19 @@ def new_state(n: int, m: int, observed: int = 0, span: Span = OWN, views: int = 
         fit=np.full(3, np.nan),
         face_px=np.full(1, np.nan),
         normal=np.zeros((COORDINATES, COORDINATES + 1)),
-        path=np.zeros((MAX_PARTS + 1, n)),
-        share=np.full(1, -1.0),
-        parts=np.zeros(1, dtype=np.int64),
-        blocked=np.full(1, -1, dtype=np.int64),
+        step=StepParts(
+            path=np.zeros((MAX_PARTS + 1, n)),
+            share=np.full(1, -1.0),
+            parts=np.zeros(1, dtype=np.int64),
+            blocked=np.full(1, -1, dtype=np.int64),
+        ),
         straight=np.zeros((views, max(m, observed), 2)),
-        clock=np.zeros(1),
-        A_ref=np.zeros((m, 4)),
-        s_ref=np.zeros((views, m, 2)),
-        q_ahead=np.zeros(n),
+        plan=AlongPlan(
+            clock=np.zeros(1),
+            A_ref=np.zeros((m, 4)),
+            s_ref=np.zeros((views, m, 2)),
+            q_ahead=np.zeros(n),
+        ),
     )
 
 
@@ -199,15 +215,15 @@ def reset(state: State) -> None:
     """Reset a state to the initial one, for another run."""
     state.driven[:] = 0.0
     state.q_dot[:] = 0.0
-    state.q_ahead[:] = 0.0
+    state.plan.q_ahead[:] = 0.0
     state.errors[:] = math.nan
     state.fit[:] = math.nan
     state.face_px[0] = math.nan
     state.limited[0] = 0.0
-    state.share[0] = -1.0
-    state.parts[0] = 0
-    state.blocked[0] = -1
-    state.clock[0] = 0.0
+    state.step.share[0] = -1.0
+    state.step.parts[0] = 0
+    state.step.blocked[0] = -1
+    state.plan.clock[0] = 0.0
 
 
 @inline
@@ -289,7 +305,7 @@ def _current_target(task: Task, state: State) -> Task:
     """Task with the current pose of the plan as its target; the task itself without a plan."""
     if not following(task.reference):
         return task
-    return Task(task.s_star, state.A_ref, *task[2:])
+    return Task(task.s_star, state.plan.A_ref, *task[2:])
 
 
 @merged
@@ -400,7 +416,7 @@ def view_into(model: Model, task: Task, s: FloatArray, state: State, view: int, 
             system.B[i, first + 2 * k + 1] = v_dot
     for k in range(state.A.shape[0]):
         if following(task.reference):
-            u, v = float(state.s_ref[view, k, 0]), float(state.s_ref[view, k, 1])
+            u, v = float(state.plan.s_ref[view, k, 0]), float(state.plan.s_ref[view, k, 1])
         else:
             target = task.s_star[view, k]
             u, v = undistort_pixel(model.lens[view], float(target[0]), float(target[1]))

@@ -88,17 +88,17 @@ def run_compiled(law: Law, course: Course, noise: FloatArray, state: State, log:
         elif verdict == RUNNING:
             asked = Command(
                 q_dot=state.q_dot,
-                share=state.share[0],
-                blocked=state.blocked[0],
+                share=state.step.share[0],
+                blocked=state.step.blocked[0],
                 period=law.gains.period,
                 scale=1.0,
             )
             verdict = bounded(log, k, asked, plant, limits)
-            if verdict == RUNNING and law.gains.substeps and 0 < state.parts[0] < log.path.shape[1]:
-                log.parts[k] = state.parts[0]
-                for j in range(state.parts[0] + 1):
+            if verdict == RUNNING and law.gains.substeps and 0 < state.step.parts[0] < log.path.shape[1]:
+                log.parts[k] = state.step.parts[0]
+                for j in range(state.step.parts[0] + 1):
                     for i in range(n):
-                        log.path[k, j, i] = state.path[j, i]
+                        log.path[k, j, i] = state.step.path[j, i]
         if verdict >= 0:
             return verdict, k
         for i in range(n):

@@ -208,13 +208,13 @@ class BuiltInLaw:
         self._weight = np.ones((V, len(task.body.M)))
         self.law = make_law(code, model, self._weighed(task), gains)
         self._bound: Any = None  # until it is called from Python
-        self.errors, self.share, self.fit = self.state.errors, self.state.share, self.state.fit
-        self.face_px, self.blocked = self.state.face_px, self.state.blocked
+        self.errors, self.share, self.fit = self.state.errors, self.state.step.share, self.state.fit
+        self.face_px, self.blocked = self.state.face_px, self.state.step.blocked
 
     def follow(self, task: Task) -> None:
         """Follow another plan to the goal from its beginning."""
         self.law = self.law._replace(task=self._weighed(task))
-        self.state.clock[0] = 0.0
+        self.state.plan.clock[0] = 0.0
         self._bound = None
 
     def _weighed(self, task: Task) -> Task:
@@ -229,7 +229,11 @@ class BuiltInLaw:
     @property
     def path(self) -> FloatArray:
         """Joints (parts + 1, n) between the parts of the last step; one row if it has none."""
-        return self.state.path[: self.state.parts[0] + 1] if self.gains.substeps else self.state.path[:1]
+        return (
+            self.state.step.path[: self.state.step.parts[0] + 1]
+            if self.gains.substeps
+            else self.state.step.path[:1]
+        )
 
     def __call__(self, s: FloatArray, q: FloatArray) -> tuple[int, FloatArray]:
         """Status and joint velocity of one instant."""

@@ -103,7 +103,7 @@ class ExecutionMonitor:
                 return self._replanned(log, k, verdict, "face_back")
             self.attempts.append(Finding("passed_over", NOTE, amount=k, unit="1"))
             return verdict
-        path, clock = self.law.law.task.reference.q, float(self.law.state.clock[0])
+        path, clock = self.law.law.task.reference.q, float(self.law.state.plan.clock[0])
         if clock < len(path) - 1:
             if verdict == DIVERGED and np.isfinite(q_dot).all():
                 verdict = RUNNING  # a path may lead away from the goal
@@ -160,7 +160,7 @@ class ExecutionMonitor:
             self._lost += 1
             self._blind = _ON if self._may_pass and self._lost > 1 else _BACK
         end = float(len(path) - 1)
-        clock = min(float(state.clock[0]), end) + self._blind
+        clock = min(float(state.plan.clock[0]), end) + self._blind
         self._waited = self._waited + 1 if clock > end else 0
         if clock < 0.0:
             return MARKERS_LOST
@@ -168,7 +168,12 @@ class ExecutionMonitor:
             self._blind, self._excluded = 0, [*self._excluded, path[-1].copy()]
             return self._replanned(log, k, MARKERS_LOST, "goal_hidden")
         clock = min(clock, end)
-        state.clock[0], state.parts[0], state.share[0], state.blocked[0] = clock, 0, -1.0, -1
+        state.plan.clock[0], state.step.parts[0], state.step.share[0], state.step.blocked[0] = (
+            clock,
+            0,
+            -1.0,
+            -1,
+        )
         there = np.array([np.interp(clock, np.arange(len(path)), joint) for joint in path.T])
         q_dot[:] = (there - log.read[k]) / self.law.gains.period
         return RUNNING

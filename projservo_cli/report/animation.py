@@ -390,7 +390,10 @@ def _frames(traces: Mapping[str, Trace], order: IntArray, sizes: FloatArray) -> 
     every = [t[:, :, order].reshape(-1, 2) for run in traces.values() for t in (run.s, run.s_star[None])]
     size, views = sizes.max(axis=0), len(sizes)
     near = style.near_pixels(np.concatenate(every), size)
-    films = {name: frames_of_run(run, width=_FILM_WIDTH) for name, run in traces.items()}
+    films = {
+        name: None if run.frames is None else frames_of_run(run.frames, width=_FILM_WIDTH)
+        for name, run in traces.items()
+    }
     margin = 0.06
     if any(film is not None for film in films.values()):  # whole images
         near, margin = np.array([[-0.5, -0.5], size - 0.5]), 0.0

@@ -7,7 +7,7 @@ from typing import Self
 
 from projservo_cli.findings import NOTE, REFUSES, Finding, Subject
 from projservo_cli.messages import failed
-from projservo_cli.records import FloatArray, InputError, WorkFailed
+from projservo_cli.records import InputError, WorkFailed
 from projservo_cli.robots.contract import PluginRobot, at_rest_after
 from projservo_cli.robots.object_watch import LOOKS, ObjectWatch
 from projservo_cli.robots.pacing import Steered
@@ -43,11 +43,6 @@ class Session:
         self.robot, self.steered = robot, Steered(robot)
         return self.steered
 
-    def reading(self) -> FloatArray:
-        """Joints (n,) of the robot, rad or m; no joint is moved."""
-        assert self.robot is not None
-        return self.robot.read().q
-
     def require_acts(self, names: Collection[str]) -> None:
         """Refuse a robot without actions that are asked for; an InputError before anything moves."""
         if names and self.robot is not None and not self.robot.acts:
@@ -62,8 +57,8 @@ class Session:
         The first action at the goal of an object takes it, the next of its name lets go of it.
         """
         takes = None if name in self.held else self.at
-        if takes is not None:
-            self._require_there(takes)
+        if takes is not None and self.steered is not None:
+            _require_there(takes, self.steered)
         seconds = 0.0 if self.robot is None else self.robot.act(name, value)
         self.acted[name] = value
         self.hold(seconds)
@@ -73,19 +68,6 @@ class Session:
         if (lost := self.lost) is not None:
             raise failed([lost])
         return seconds
-
-    def _require_there(self, watch: ObjectWatch) -> None:
-        """Look whether the object that the arm is about to take lies where the motion was planned to."""
-        assert self.steered is not None
-        for _ in range(LOOKS):
-            watch.observe(self.steered.hold())
-            if watch.moved:
-                raise failed([watch.moved], stage="nothing was taken")
-        if not watch.seen:
-            raise WorkFailed(
-                f"nothing was taken: no image shows the object {watch.name} where it is to be: look where it "
-                "lies, and what hides it, then run again"
-            )
 
     def empty(self, name: str) -> bool:
         """Whether a gripper closed by an action is empty, as far as the robot can tell."""
@@ -113,3 +95,16 @@ class Session:
     def kept(self) -> tuple[Finding, ...]:
         """States that stay as sent, such as a grip."""
         return tuple(Finding("stays", NOTE, Subject(name=name), at) for name, at in self.acted.items())
+
+
+def _require_there(watch: ObjectWatch, steered: Steered) -> None:
+    """Look whether the object that the arm is about to take lies where the motion was planned to."""
+    for _ in range(LOOKS):
+        watch.observe(steered.hold())
+        if watch.moved:
+            raise failed([watch.moved], stage="nothing was taken")
+    if not watch.seen:
+        raise WorkFailed(
+            f"nothing was taken: no image shows the object {watch.name} where it is to be: look where it "
+            "lies, and what hides it, then run again"
+        )

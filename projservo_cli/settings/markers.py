@@ -44,6 +44,11 @@ class Tag(Section):
         T = np.array(self.pose)
         return np.asarray(self.size_m * np.array(_CORNERS) @ T[:3, :2].T + T[:3, 3])
 
+    @property
+    def normal(self) -> FloatArray:
+        """Direction (3,) that it looks in."""
+        return np.array(self.pose)[:3, 2]
+
     def at(self, T: FloatArray) -> "Tag":
         """The tag after a displacement (4, 4)."""
         pose = tuple(tuple(row) for row in (T @ np.array(self.pose)).tolist())
@@ -213,18 +218,18 @@ class Markers(Section):
         """Directions (m, 3) that corners of tags look in, in the frame of the tool; None for others."""
         if self.tags is None:
             return None
-        return np.repeat([np.array(tag.pose)[:3, 2] for tag in self.all_tags], CORNERS, axis=0)
+        return np.repeat([tag.normal for tag in self.all_tags], CORNERS, axis=0)
 
     @property
-    def known(self) -> tuple[int, ...] | None:
-        """Numbers of all markers, in the order of ``points``; None if a table has them."""
+    def known(self) -> tuple[int, ...]:
+        """Numbers of all markers, in the order of ``points``; none if a table has them."""
         if self.board is not None:
             return tuple(range(len(self.board.pattern.grid_points)))
         if self.tags is not None:
             return tuple(number for tag in self.all_tags for number in tag.numbers)
         if self.numbers is None and self.positions_m is not None:
             return tuple(range(len(self.positions_m)))
-        return self.numbers
+        return self.numbers or ()
 
     @property
     def front(self) -> tuple[int, ...] | None:
@@ -237,18 +242,14 @@ class Markers(Section):
             return (0, columns - 1, rows * columns - 1, (rows - 1) * columns)
         if self.face is not None or self.tags is None:
             return self.face
-        normals, known = self.normals, self.known
-        assert normals is not None
-        assert known is not None
-        first = int(np.argmax((normals @ normals.sum(axis=0)).round(6)))
-        return known[first : first + CORNERS]
+        normals = np.array([tag.normal for tag in self.all_tags])
+        return self.all_tags[int(np.argmax((normals @ normals.sum(axis=0)).round(6)))].numbers
 
     def lengths(self, numbers: Sequence[int]) -> FloatArray:
         """Distances (k, k) between markers of some numbers, m; NaN if unknown."""
         X, tag = np.full((len(numbers), 3), np.nan), np.zeros(len(numbers))
         if self.points is not None:
-            known = self.known or ()
-            X = self.points[[known.index(number) for number in numbers]]
+            X = self.points[[self.known.index(number) for number in numbers]]
         elif self.board is not None and self.board.size_m is not None:
             X[:, 2], X[:, :2] = 0.0, self.board.size_m * self.board.pattern.grid_points[[*numbers]]
         elif self.tag_size_m is not None:
@@ -272,7 +273,7 @@ class Markers(Section):
         if len(set(numbers)) < len(numbers):
             yield ("tags",), "the number of a tag occurs here twice"
         known, face = self.known, self.front or ()
-        if known is not None:
+        if known:
             if self.positions_m is not None and len(known) != len(self.positions_m):
                 yield ("numbers",), f"{len(known)} numbers for {len(self.positions_m)} positions_m"
             if self.numbers is not None and len(set(known)) < len(known):
@@ -286,7 +287,7 @@ class Markers(Section):
     def unknown(self, numbers: Sequence[int], *path: str) -> Iterator[Note]:
         """Numbers at a path that no marker has, as far as markers are known."""
         for i, number in enumerate(numbers):
-            if self.known is not None and number not in self.known:
+            if self.known and number not in self.known:
                 yield (*path, i), f"there is no marker {number}; markers: {_listed(self.known)}"
 
 

@@ -100,7 +100,7 @@ class ObjectSettings(OneOf):
         """Directions (k, 3) that its tags look in; zero for markers that are seen from anywhere."""
         if not self.placed:
             return np.zeros((len(self.numbers), 3))
-        return np.repeat([np.array(tag.pose)[:3, 2] for tag in self.placed], CORNERS, axis=0)
+        return np.repeat([tag.normal for tag in self.placed], CORNERS, axis=0)
 
     @property
     def moved(self) -> FloatArray:

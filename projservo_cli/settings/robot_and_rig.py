@@ -96,7 +96,7 @@ class _ScrewJoint(_Joint):
         yield from (((key,), what) for key, what in not_a_screw(self.type, self.w, self.v))
 
 
-class _DH(Section):
+class DHTable(Section):
     """A Denavit-Hartenberg table, standard or modified (Craig)."""
 
     convention: Literal["standard", "modified"] = Field(
@@ -108,7 +108,7 @@ class _DH(Section):
     tool: Pose = Field(_IDENTITY, description="pose of the tool in the frame of the last joint, m")
 
 
-class _Screws(Section):
+class Screws(Section):
     """Joint screws at a reference: T(q) = Π exp(screw_i (q_i − reference_i)) · base_tool."""
 
     reference: JointVector = Field(description="joint readings of the pose in which the screws are given")
@@ -157,7 +157,7 @@ class FlangeSettings(Section):
 
 
 @lru_cache(maxsize=32)  # asked for wherever the joints of a robot are
-def _screws_of(flange: FlangeSettings) -> _Screws:
+def _screws_of(flange: FlangeSettings) -> Screws:
     """Readings of poses of the flange as joints of an arm."""
     place = np.array(flange.home)[:3, 3]
     slides = ((np.array(flange.box_mm) / MM - place[:, None]) + 0.0).tolist()
@@ -174,7 +174,7 @@ def _screws_of(flange: FlangeSettings) -> _Screws:
         )
     ]
     reference = {"joints": [0.0] * 6, "unit": "rad"}
-    return _Screws.model_validate({"reference": reference, "base_tool": flange.home, "joints": joints})
+    return Screws.model_validate({"reference": reference, "base_tool": flange.home, "joints": joints})
 
 
 class LimitSettings(OneOf):
@@ -214,8 +214,8 @@ class RobotSettings(Section):
     """
 
     name: str = Field("", description="name in figures and reports")
-    dh: _DH | None = Field(None, description="Denavit-Hartenberg table")
-    screws: _Screws | None = Field(None, description="joint screws at a reference")
+    dh: DHTable | None = Field(None, description="Denavit-Hartenberg table")
+    screws: Screws | None = Field(None, description="joint screws at a reference")
     mjcf: Text | None = Field(
         None, description="path of a MuJoCo model, which the plant mujoco simulates and renders"
     )
@@ -229,11 +229,15 @@ class RobotSettings(Section):
     @property
     def joints(self) -> tuple[_Joint, ...]:
         """The joints from base to tool."""
-        kinematics = self.dh or self.twists
-        return kinematics.joints if kinematics is not None else ()
+        return self.kinematics.joints if self.kinematics is not None else ()
 
     @property
-    def twists(self) -> _Screws | None:
+    def kinematics(self) -> DHTable | Screws | None:
+        """The description of its joints; None for limits alone, or before a file is read."""
+        return self.dh or self.twists
+
+    @property
+    def twists(self) -> Screws | None:
         """Joint screws, as given or of poses of the flange."""
         return self.screws if self.flange is None else _screws_of(self.flange)
 

@@ -16,7 +16,7 @@ from projservo_cli.records import TOOL, FloatArray, no_lenses, position_limits, 
 from projservo_cli.result_hashes import File
 from projservo_cli.settings.markers import Markers, Tag
 from projservo_cli.settings.plant import RenderedOptions
-from projservo_cli.settings.robot_and_rig import Camera, Rig, RobotSettings
+from projservo_cli.settings.robot_and_rig import Camera, Rig, RobotSettings, Screws
 from projservo_cli.simulation.arm import Link, SerialArm, dh_twists
 from projservo_cli.simulation.ground_truth import Truth
 from projservo_cli.simulation.random_streams import NoiseShape
@@ -30,11 +30,12 @@ def arm_of(robot: RobotSettings) -> SerialArm:
     kinds = robot.joint_types
     prismatic = prismatic_of(kinds)
     limits = position_limits(*np.array(robot.ranges, dtype=np.float64).T.copy())
-    if (screws := robot.twists) is not None:
+    if isinstance(screws := robot.kinematics, Screws):
         H_hat = twists(np.array([[*joint.w, *joint.v] for joint in screws.joints], dtype=np.float64))
         q_reference = screws.reference.values(kinds)
         return SerialArm(H_hat, prismatic, q_reference, np.array(screws.base_tool), limits)
-    assert robot.dh is not None
+    if robot.dh is None:
+        raise ValueError("joints of a robot of limits alone are not described")
     table = robot.dh
     links = [
         Link(row.type, math.radians(row.theta_deg), row.d_m, row.a_m, math.radians(row.alpha_deg))
@@ -51,15 +52,17 @@ def cameras_of(rig: Rig) -> FloatArray:
 
 
 def _camera(camera: Camera) -> FloatArray:
-    if camera.matrix is not None:
+    focal, middle, position, target = (
+        camera.focal_px,
+        camera.principal_point_px,
+        camera.position_m,
+        camera.target_m,
+    )
+    if focal is None or middle is None or position is None or target is None:
         return _metric_camera(np.array(camera.matrix))
-    assert camera.focal_px is not None
-    assert camera.principal_point_px is not None
-    assert camera.position_m is not None
-    assert camera.target_m is not None
-    (f_u, f_v), (u, v) = camera.focal_px, camera.principal_point_px
+    (f_u, f_v), (u, v) = focal, middle
     K = np.array([[f_u, 0.0, u], [0.0, f_v, v], [0.0, 0.0, 1.0]])
-    return _camera_towards(K, camera.position_m, camera.target_m, camera.up)
+    return _camera_towards(K, position, target, camera.up)
 
 
 def _metric_camera(P: FloatArray) -> FloatArray:
@@ -97,7 +100,6 @@ def described_truth(
     """
     coefficients = np.array([(k1, 0.0) if k1 else camera.lens for camera in rig.cameras.values()])
     arm, P, numbers = arm_of(robot), cameras_of(rig), markers.known
-    assert numbers is not None
     points, on_tool = np.c_[markers.points, np.ones(len(numbers))], rig.mount == TOOL
     # Parts on the tool are given in its frame, fixed ones in the frame of the base.
     base_tool = np.eye(4) if on_tool else arm.base_tool
@@ -130,7 +132,6 @@ def described_scene(
 
     mjcf : the model of the arm, None for capsules; objects : tags of objects at their places.
     """
-    assert markers.known is not None
     further = [number for tag in objects for number in tag.numbers]
     return RenderedScene(
         arm=arm_of(robot),

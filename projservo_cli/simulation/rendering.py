@@ -215,9 +215,7 @@ def _add_tags(
     mj = mujoco()
     body, origin = holder.add_body(name="scene with tags" if in_scene else "tool with tags"), tool[:3, 3]
     if in_scene:  # rods meet behind the tags
-        origin = np.mean(
-            [np.array(tag.pose)[:3, 3] - tag.size_m * np.array(tag.pose)[:3, 2] for tag in tags], 0
-        )
+        origin = np.mean([np.array(tag.pose)[:3, 3] - tag.size_m * tag.normal for tag in tags], 0)
     if not any(material.name == "tag holder" for material in spec.materials):
         spec.add_material(name="tag holder", rgba=_HOLDER, specular=0.0)
 

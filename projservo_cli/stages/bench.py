@@ -23,7 +23,7 @@ from projservo_cli.loop.verdicts import Log, new_log
 from projservo_cli.records import FloatArray
 from projservo_cli.simulation.analytic_plant import Plant
 from projservo_cli.stages.scenario import run_scenario
-from projservo_cli.stages.stage_inputs import ServoInputs
+from projservo_cli.stages.stage_inputs import ServoInputs, of_simulation
 from projservo_cli.task.face import Task
 from projservo_cli.task.incidences import whole_pose
 
@@ -46,9 +46,8 @@ class Case:
     """A noisy run of 256 states of a simulated task and all that a step needs, with the true model."""
 
     def __init__(self, inputs: ServoInputs) -> None:
-        assert inputs.plan.truth is not None
         given = replace(inputs, plan=replace(inputs.plan.of_taught_pose, features="body"))
-        scenario = run_scenario(given, inputs.plan.truth.calibration)
+        scenario = run_scenario(given, of_simulation(inputs.plan.described.truth).calibration)
         shown, gains = scenario.exact, scenario.gains
         self.m, self.q_start, self.model, self.gains = (
             scenario.world.m,

@@ -24,7 +24,7 @@ from projservo_cli.image_size import image_sizes
 from projservo_cli.messages import lines, with_findings
 from projservo_cli.messages.rows_by_code import Setup
 from projservo_cli.metric.frame import Metric
-from projservo_cli.observations import Observations
+from projservo_cli.observations import KnownNoise, Observations
 from projservo_cli.planning.pose_selection import FARTHER, Suggestion, region_around, suggest
 from projservo_cli.records import (
     ONLY,
@@ -50,6 +50,7 @@ from projservo_cli.stages.stage_inputs import (
     SuggestionInputs,
     Table,
     Trials,
+    of_simulation,
 )
 from projservo_cli.store.camera_files import Intrinsics, read_intrinsics
 from projservo_cli.store.files_and_locks import write_whole
@@ -83,7 +84,7 @@ def run(
     else:
         seen = simulated(source, progress=progress)
     if inputs.joint_noise is not None:
-        seen = replace(seen, joint_noise=inputs.joint_noise)
+        seen = replace(seen, noise=seen.noise._replace(joint=inputs.joint_noise))
     return estimate(seen, inputs.estimation, progress=progress)
 
 
@@ -110,7 +111,7 @@ def recorded(table: Table) -> Observations:
         else read_detections(table.file.path, table.readings.path, *unit, chart=chart),
         joint_types=table.joint_types,
         image_size=table.image_size,
-        noise_px=table.noise_px,
+        noise=KnownNoise(table.noise_px),
         seed=table.seed,
         mount=table.mount or mount_in(table.file.path),
         order_stated=table.order_stated,
@@ -123,19 +124,16 @@ def simulated(
     """Simulate the trial motions, or poses (K, n), rad or m; the observations."""
     observation, noise_px = observed(trials, q, seed, progress=progress)
     observation = replace(observation, flange_chart=trials.joints.flange_chart)
-    assert trials.truth is not None
-    truth, ideal = trials.truth, trials.driven is None
+    truth, ideal = of_simulation(trials.truth), trials.driven is None
     normal, straight = truth.noise == NORMAL, not truth.lens[:, K1:].any()
     sizes = tuple(map(tuple, truth.image_size.astype(int).tolist()))
     return Observations.of(
         observation,
         joint_types=trials.joints.types,
         image_size=sizes[0] if len({*sizes}) == 1 else sizes,
-        noise_px=noise_px if normal else None,
         # Where joints or images have faults, χ² of pixel noise alone decides no more than in a recording.
-        joint_noise=0.0 if ideal else None,
+        noise=KnownNoise(noise_px if normal else None, 0.0 if ideal else None, ideal and normal and straight),
         source="simulated",
-        exact=ideal and normal and straight,
         seed=trials.motions.seed,
         mount=TOOL if truth.on_tool else WORLD,
     )

@@ -95,9 +95,8 @@ def _carried(scenario: Scenario, carrier: CarryingObject, session: Session | Non
 @lru_cache(maxsize=8)  # the same for all laws of a plan
 def markers_now(c: Calibration, carried: CarriedByObject) -> UncertainPoints:
     """Return the markers of an object of a plan where it is now."""
-    numbers, taught = carried.object_marker.tolist(), carried.s_object_taught
-    assert taught is not None
-    observed = [ObjectView(taught), ObjectView(carried.s_object, carried.sigma_object)]
+    numbers = carried.object_marker.tolist()
+    observed = [ObjectView(carried.s_object_taught), ObjectView(carried.s_object, carried.sigma_object)]
     return DisplacedObject.of(c, numbers, observed).markers_now(numbers)
 
 

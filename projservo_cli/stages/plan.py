@@ -135,7 +135,7 @@ def run(
     Raises InputError if the task is missing; WorkFailed if it cannot be partitioned.
     """
     known = set(calibration.marker.tolist())
-    missing = [number for number in inputs.face if number not in known]
+    missing = [number for number in inputs.markers.face if number not in known]
     if missing:
         raise WorkFailed(
             f"markers.face names marker {missing[0]}, which the calibration has not seen: "
@@ -147,7 +147,7 @@ def run(
     carried = carried_by(scenario, inputs.carriers, before, session)
     scenario = scenario.carried(carried)
     plan = _to_any_goal(scenario) if inputs.incidences else _plan_in(scenario)
-    face = metric_points(scenario.world.model, calibration.M[calibration.indices_of(inputs.face)])
+    face = metric_points(scenario.world.model, calibration.M[calibration.indices_of(inputs.markers.face)])
     further = (
         *calibration.open_order,
         *_borders(inputs, calibration.view),
@@ -242,7 +242,7 @@ def _require_taught_since(scenario: Scenario, calibration: Calibration) -> None:
     images = task.goal.images if task is not None else None
     if images is None or (whole := scenario.goal_pixels) is None:
         return
-    view, face = calibration.view, scenario.world.inputs.face
+    view, face = calibration.view, scenario.world.inputs.markers.face
     pixels, size = images.pixels(face, view), image_sizes(scenario.world.inputs.image_size, view)
     numbers, seen = np.array([*pixels]), np.swapaxes(np.array([*pixels.values()]), 0, 1)
     if images.joints is not None:
@@ -251,7 +251,7 @@ def _require_taught_since(scenario: Scenario, calibration: Calibration) -> None:
             raise failed([fault], setup_of(calibration), "; teach it again", stage=CHANGED)
         _require_rigid(rigid_fit(calibration, q, *whole), setup_of(calibration), "teach it again")
         return
-    stated = images.sigma_px(scenario.world.numbers[: scenario.world.m], scenario.world.inputs.face)
+    stated = images.sigma_px(scenario.world.numbers[: scenario.world.m], scenario.world.inputs.markers.face)
     sigma = scenario.world.noise_px if stated is None else stated
     known, near_px = np.isin(numbers, calibration.marker), max(NEAR_PX, 2.0 * sigma)
     seen_markers = numbers[known].tolist(), seen[:, known]

@@ -30,7 +30,7 @@ from projservo_cli.records import (
     Observation,
 )
 from projservo_cli.report.image_pages import annotated, recording_page
-from projservo_cli.robots.contract import PluginRobot, Reading, at_rest_after
+from projservo_cli.robots.contract import PluginRobot, Reading, Robot, at_rest_after
 from projservo_cli.robots.joint_limits import Joints
 from projservo_cli.robots.pacing import Steered
 from projservo_cli.robots.standstill import averaged
@@ -38,7 +38,7 @@ from projservo_cli.simulation.ground_truth import Truth
 from projservo_cli.simulation.random_streams import CALIBRATION_NOISE, POSE_NOISE, TRIAL_POSES, generator
 from projservo_cli.simulation.robot_with_faults import robot_by_itself
 from projservo_cli.stages import Progress, silent
-from projservo_cli.stages.stage_inputs import OwnRobot, RecordingInputs, Trials
+from projservo_cli.stages.stage_inputs import OwnRobot, RecordingInputs, Trials, of_simulation
 from projservo_cli.stages.worlds.external_robot import path_to, plugin_robot, simulated_robot
 from projservo_cli.store.files_and_locks import write_whole
 from projservo_cli.store.observation_tables import identity_in, read_table, recording_of, write_table
@@ -298,6 +298,7 @@ def record_poses(
     recording: _Recording,
     robot: PluginRobot | None = None,
     *,
+    given: Robot | None = None,
     kept: bool = True,
     progress: Progress = silent,
 ) -> None:
@@ -306,12 +307,13 @@ def record_poses(
     kept : whether the table is written.
     robot : the robot to drive; None takes that of ``plant.use``, or simulates the configured robot,
         which follows its set-points exactly unless it has faults.
+    given : an object of the contract instead of one of the class.
     """
     if not recording.pending:
         return
     trials, sight = inputs.trials, _Sight(inputs, recording)
     drawn = trials.motions.seed, CALIBRATION_NOISE
-    robot = robot or _robot_of(trials, recording, drawn)
+    robot = robot or _robot_of(trials, recording, drawn, given)
     poses = (
         _simulated(trials, recording, drawn) if robot is None else _recorded(robot, trials, recording, sight)
     )
@@ -360,19 +362,20 @@ def _show(recording: _Recording, robot: PluginRobot | None) -> None:
     write_whole(recording.path.with_suffix(".html"), text)
 
 
-def _robot_of(trials: Trials, recording: _Recording, drawn: tuple[int, int]) -> PluginRobot | None:
+def _robot_of(
+    trials: Trials, recording: _Recording, drawn: tuple[int, int], given: Robot | None = None
+) -> PluginRobot | None:
     """The robot that is to be driven; None for one that need not be.
 
     drawn : seed and stream of the random numbers of a simulated one.
+    given : an object of the contract instead of one of a class.
     """
     driven, joints = trials.driven, trials.joints.joints()
     if driven is None:
         return None
     if isinstance(driven.robot, OwnRobot):
-        bounds = driven.following.bounds(joints)
-        return plugin_robot(
-            driven.robot, bounds, joints.types, recording.marker.tolist(), further=driven.further
-        )
+        known = driven.robot, driven.following.bounds(joints), joints.types, recording.marker.tolist()
+        return plugin_robot(*known, given, further=driven.further)
     first = recording.targets[recording.pending[0]]
     return simulated_robot(driven, joints, robot_by_itself(driven.robot, first, trials.noise_px, drawn))
 
@@ -385,8 +388,7 @@ def observed(
     q : (K, n) poses, rad or m, with a separate stream of noise; None for the trial motions.
     seed : of that noise; None for the seed of the trials.
     """
-    truth, sigma_px = trials.truth, trials.noise_px
-    assert truth is not None
+    truth, sigma_px = of_simulation(trials.truth), trials.noise_px
     targets = trial_motions(trials) if q is None else q
     drawn = trials.motions.seed if seed is None else seed, CALIBRATION_NOISE if q is None else POSE_NOISE
     recording = _Recording(Path(), "", targets, np.array(truth.number))
@@ -405,8 +407,7 @@ def observed(
 
 def _simulated(trials: Trials, recording: _Recording, drawn: tuple[int, int]) -> Iterator[int]:
     """One pending pose after the other as calibrate simulates it; the number of each."""
-    assert trials.truth is not None
-    seen = noisy_observation(trials.truth, recording.targets, trials.noise_px, drawn)
+    seen = noisy_observation(of_simulation(trials.truth), recording.targets, trials.noise_px, drawn)
     for pose in recording.pending:
         recording.done[pose] = Reading(
             seen.q[pose], seen.images[pose], np.nan, np.full(len(seen.view), np.nan), None

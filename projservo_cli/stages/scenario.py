@@ -143,7 +143,9 @@ class Scenario:
     def _tags(self) -> IntArray:
         """Corners (t, 4) of tags among the markers; none for tools of which no tag is on the face."""
         order = self.world.numbers
-        tags = [[order.index(k) for k in tag] for tag in self.world.inputs.tags if set(tag) <= set(order)]
+        tags = [
+            [order.index(k) for k in tag] for tag in self.world.inputs.markers.tags if set(tag) <= set(order)
+        ]
         if not any(max(tag) < self.world.m for tag in tags):
             tags = []
         return np.array(tags, dtype=np.int64).reshape(-1, CORNERS)
@@ -155,7 +157,7 @@ class Scenario:
         stated = (
             None
             if images is None
-            else images.sigma_px(self.world.numbers[: self.world.m], self.world.inputs.face)
+            else images.sigma_px(self.world.numbers[: self.world.m], self.world.inputs.markers.face)
         )
         if stated is not None:
             return stated
@@ -177,7 +179,9 @@ class Scenario:
         world, given = self.world, self.world.goal_images
         if given is None or not world.calibration.has_covariance:
             return None
-        s, sigma = given_pixels(given, world.calibration.marker.tolist(), world.inputs.face, world.view)
+        s, sigma = given_pixels(
+            given, world.calibration.marker.tolist(), world.inputs.markers.face, world.view
+        )
         return s, np.where(np.isnan(sigma), world.noise_px, sigma)
 
     def images_at(self, seed: int) -> TaskImages:
@@ -231,7 +235,7 @@ def world_of(inputs: PlanInputs, calibration: Calibration) -> CalibratedWorld:
     Raises InputError if the calibration is of other views or markers, and for points without two views;
     WorkFailed for an arm of one joint.
     """
-    truth, face = inputs.truth, inputs.face
+    truth, face = inputs.described.truth, inputs.markers.face
     joints = inputs.joints.joints(calibration.joint_types, calibration)
     if len(joints.types) == 1:
         raise WorkFailed(
@@ -244,7 +248,7 @@ def world_of(inputs: PlanInputs, calibration: Calibration) -> CalibratedWorld:
     if not measures_points(inputs.features, calibration):
         known = calibration.marker.tolist()
         pins = tuple(number for number in observed if number in known and number not in face)
-    parts, scene = (inputs, calibration, joints, (*face, *pins)), inputs.scene
+    parts, scene = (inputs, calibration, joints, (*face, *pins)), inputs.described.scene
     if truth is None:
         return CalibratedWorld(*parts)
     return SimulatedWorld(*parts, truth) if scene is None else RenderedWorld(*parts, truth, scene)

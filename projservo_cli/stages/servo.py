@@ -16,7 +16,7 @@ from projservo_cli.records import (
     WorkFailed,
 )
 from projservo_cli.simulation.analytic_plant import AnalyticPlant
-from projservo_cli.stages.runs.law_run import LawRun
+from projservo_cli.stages.runs.law_run import Brought, LawRun, PlannedCourse
 from projservo_cli.stages.runs.run_trace import trace_of
 from projservo_cli.stages.scenario import RunScenario, run_scenario
 from projservo_cli.stages.stage_inputs import ServoInputs
@@ -30,7 +30,7 @@ def run(inputs: ServoInputs, calibration: Calibration, plan: Plan, name: str, **
     """Drive one law in one mode from the start of the task to its verdict.
 
     name : of the run: the law's, with the mode if it follows the plan, such as ``exact_track``.
-    brought : by a caller: ``factory``, ``robot``, ``blind`` and ``session`` of ``LawRun``.
+    brought : by a caller: ``factory``, ``robot``, ``blind`` and ``session`` of ``Brought``.
     Raises InputError if a part of the simulation is missing, the plan is of another task, or the plan to
     follow has no time; WorkFailed if the goal cannot be reached, or the joints cannot follow the plan and
     ``refuses`` is set.
@@ -79,7 +79,8 @@ def drive(
             unplanned = f"no joints can follow the plan: {plan.reason}"
         elif plan.duration is not None:
             planned_s = plan.duration / scenario.gains.scale
-    run = LawRun(scenario, plan, law, mode, planned_s, unplanned, believed, **brought)
+    course = PlannedCourse(mode, planned_s, unplanned)
+    run = LawRun(scenario, plan, law, course, believed, Brought(**brought))
     if scenario.servo.contract is not None:
         run.by_contract()
     elif isinstance(plan, Plan) and (not _in_compiled_loop(scenario.servo, law) or run.is_guided):

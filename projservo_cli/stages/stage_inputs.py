@@ -124,6 +124,13 @@ class Motions(NamedTuple):
     seed: int
 
 
+def of_simulation(truth: Truth | None) -> Truth:
+    """Return the truth of a simulated robot. Raises InputError for a user's robot."""
+    if truth is None:
+        raise InputError("this needs a simulated robot: describe robot, rig and markers, without plant.use")
+    return truth
+
+
 @dataclass(frozen=True, eq=False)
 class Trials:
     """Trial motions, and the robot that is driven through them."""
@@ -259,21 +266,41 @@ class PreflightInputs:
 
 
 @dataclass(frozen=True, eq=False)
-class PlanInputs:
-    """Inputs of a plan, except the calibration."""
+class Described:
+    """Robot and rig, as far as they are described."""
 
-    task: TaskSettings | None
-    seed: int  # seed of the noise of start and goal
     truth: Truth | None  # robot, rig and markers as they are; None for a robot that is not simulated
     arm: SerialArm | None  # kinematics as they are described, if they are
     # (V, 3, 4) described cameras, px, if any: from the frame of their mount
     P: FloatArray | None
     mount: str  # mount of the cameras, world or tool
     scene: RenderedScene | None  # where cameras are rendered
+
+    def cameras_at(self, q: FloatArray) -> FloatArray | None:
+        """Cameras (V, 3, 4) from the base frame at joints (n,), rad or m, px; None if not described."""
+        if self.arm is None or self.P is None:
+            return None
+        return self.P @ np.linalg.inv(self.arm.pose(q)) if self.mount == TOOL else self.P
+
+
+@dataclass(frozen=True, eq=False)
+class ToolMarkers:
+    """Numbers of the markers of the tool."""
+
     face: tuple[int, ...]  # numbers of the markers that must stay visible
     center: int  # position of the centre marker within the face, or ``MIDPOINT``
     known: tuple[int, ...] | None  # numbers of all markers; None for the markers of the calibration
     tags: tuple[tuple[int, ...], ...]  # numbers of the corners of each tag among them
+
+
+@dataclass(frozen=True, eq=False)
+class PlanInputs:
+    """Inputs of a plan, except the calibration."""
+
+    task: TaskSettings | None
+    seed: int  # seed of the noise of start and goal
+    described: Described
+    markers: ToolMarkers
     joints: JointSettings
     image_size: ImageSize | None  # width and height, px, of both images or of one each, if known
     noise: LoopNoise  # noise of simulated pixels
@@ -301,12 +328,6 @@ class PlanInputs:
     def of_taught_pose(self) -> "PlanInputs":
         """Return the inputs of the whole pose that was taught, wherever objects are now."""
         return replace(self, incidences=(), carriers=())
-
-    def cameras_at(self, q: FloatArray) -> FloatArray | None:
-        """Cameras (V, 3, 4) from the base frame at joints (n,), rad or m, px; None if not described."""
-        if self.arm is None or self.P is None:
-            return None
-        return self.P @ np.linalg.inv(self.arm.pose(q)) if self.mount == TOOL else self.P
 
 
 class Contract(NamedTuple):

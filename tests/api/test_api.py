@@ -344,8 +344,8 @@ REFUSED = [
     ),
     (
         lambda c, k, p: ps.calibrate(ps.simulate(c), method="best", noise_px=0, lens="no"),
-        "^calibrate: noise_px: must be greater than 0, not 0\ncalibrate: method: 'best' is not one of .*\n"
-        "calibrate: lens: .*, not 'no'$",
+        "^calibrate: method: 'best' is not one of .*\ncalibrate: lens: .*, not 'no'\n"
+        "calibrate: noise_px: must be greater than 0, not 0$",
     ),
     (lambda c, k, p: ps.Experiment(c).plan, r"holds no result of plan; make it first: make\('plan'\)"),
     (lambda c, k, p: ps.Experiment(c).make("report"), "give Experiment a path"),
@@ -508,7 +508,7 @@ def test_parts_of_observations_join_to_the_whole():
         (lambda: whole.select(view="left"), "select: view 'left': choose among ['a', 'b', 'c']"),
         (lambda: ps.Observations.concat([whole, one]), "concat: the observations differ in images"),
         (lambda: ps.Observations.concat([]), "concat: an empty list"),
-        (lambda: ps.Observations.concat([whole, dataclasses.replace(whole, noise_px=1.0)]), "in noise_px"),
+        (lambda: ps.Observations.concat([whole, dataclasses.replace(whole, mount="tool")]), "in mount"),
     ):
         with pytest.raises(ps.InputError) as refused:
             call()

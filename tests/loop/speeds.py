@@ -8,7 +8,7 @@ from projservo_cli.laws import IMAGE_TRACK, LAWS, REGULATE, TRACK, law_and_mode,
 from projservo_cli.records import InputError, WorkFailed
 from projservo_cli.stages.plan import plan_task
 from projservo_cli.stages.plan_motion import search_of
-from projservo_cli.stages.runs.law_run import LawRun
+from projservo_cli.stages.runs.law_run import LawRun, PlannedCourse
 from tests.configured import scenario_of
 from tests.known import asked
 
@@ -34,7 +34,7 @@ def highest_shares(config, profiles=("linear",), max_steps=40):
         for name in RUNS:
             law, mode = law_and_mode(name)
             if (mode == REGULATE and (name, profiles[0]) not in found) or np.isfinite(plan.q).all():
-                run = LawRun(scenario, plan, law, mode)
+                run = LawRun(scenario, plan, law, PlannedCourse(mode))
                 run.compiled()
                 q = run.log.q[: run.steps + 1]
                 found[name, profile] = highest_share(q, scenario.gains.period, limits.speed)

@@ -43,9 +43,8 @@ class PathReplanner:
 
 def watched(ways, clock=0.0, searches=3, blind=True, **bounds):
     """A watch over a law on the way, that law's tasks and a log whose images are 1 px off."""
-    state = SimpleNamespace(
-        clock=np.array([clock]), parts=np.ones(1, int), share=np.zeros(1), blocked=np.zeros(1)
-    )
+    step = SimpleNamespace(parts=np.ones(1, int), share=np.zeros(1), blocked=np.zeros(1))
+    state = SimpleNamespace(plan=SimpleNamespace(clock=np.array([clock])), step=step)
     task = SimpleNamespace(reference=SimpleNamespace(q=WAY), s_star=SEEN)
     followed = []
     law = SimpleNamespace(
@@ -120,7 +119,7 @@ def test_a_lost_face_is_sought_back_along_the_path():
     for k, place in enumerate((2, 1)):
         assert watch.ruled(log, 50 + k, MARKERS_LOST if k == 0 else WAITING, q_dot) == RUNNING
         np.testing.assert_allclose(q_dot, (WAY[place] - 0.25) / 0.5)
-        assert watch.law.state.parts[0] == 0  # what the law split its last step into is not sent
+        assert watch.law.state.step.parts[0] == 0  # what the law split its last step into is not sent
     assert watch.ruled(log, 52, RUNNING, q_dot) == WAITING
     assert followed == ["another way"]
     assert told(watch.attempts[0]) == ("replanned", "face_back", 52)
@@ -136,7 +135,7 @@ def lost_again(watch, log, ways):
     """Lose the face a first time, see it again on the way back, and follow another way from there."""
     watch.ruled(log, 50, MARKERS_LOST, np.zeros(2))
     assert watch.ruled(log, 51, RUNNING, np.zeros(2)) == WAITING
-    watch.law.state.clock[0] = 17.5
+    watch.law.state.plan.clock[0] = 17.5
 
 
 @pytest.mark.parametrize(("blind", "first"), [(True, 18), (False, 16)])

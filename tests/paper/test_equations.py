@@ -194,7 +194,7 @@ def of_control(world, parts, driven, result):
     result["23"] = off(world.step("direct_two")[0], rates[0] * H_t + turn)
     one = expm(SPEEDS.period * rates[0] * H_t) @ expm(SPEEDS.period * turn)
     _, moved, run = world.step("exact")
-    if run.state.parts[0] > 0:  # else a singularity lies within the step
+    if run.state.step.parts[0] > 0:  # else a singularity lies within the step
         result["22"] = off(world.A @ moved.T, world.A @ one.T)
         A_c = world.A.mean(axis=0)
         plan = SimpleNamespace(tau=tau, theta_r=theta_r, theta_p=theta_p, H_hat=parts, A_c=A_c)

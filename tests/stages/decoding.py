@@ -8,6 +8,10 @@ from functools import cache
 import numpy as np
 
 from projservo_cli.result_hashes import File
+from projservo_cli.stages.stage_inputs import Described, ToolMarkers
+
+# Parts of records whose fields count as those of the record.
+PARTS = {"PlanInputs": {"described": Described, "markers": ToolMarkers}}
 
 
 def decoded(content, files):
@@ -46,7 +50,10 @@ def _value(plain, files):
     values = {name: _value(inner, files) for name, inner in held.items()}
     if kind == "mapping":
         return values
-    return _type_of(kind.rpartition(":")[2], tuple(values))(**values)
+    name = kind.rpartition(":")[2]
+    for part, one in PARTS.get(name, {}).items():
+        values[part] = one(**{field.name: values.pop(field.name) for field in dataclasses.fields(one)})
+    return _type_of(name, tuple(values))(**values)
 
 
 @cache

@@ -31,10 +31,10 @@ def held(record):
 def test_a_world_as_calibrated_holds_no_truth(name):
     config = configured(name)
     simulated = given.plan_inputs(config)
-    believed = world_of(given.plan_inputs(config, predicted=True), simulated.truth.calibration)
+    believed = world_of(given.plan_inputs(config, predicted=True), simulated.described.truth.calibration)
     assert type(believed) is CalibratedWorld
     assert not [one for one in held(believed) if isinstance(one, Truth)]
-    known = world_of(simulated, simulated.truth.calibration)
+    known = world_of(simulated, simulated.described.truth.calibration)
     assert type(known) is WORLDS[name]
     assert [one for one in held(known) if isinstance(one, Truth)]
 

@@ -3,13 +3,22 @@
 import io
 import math
 import textwrap
+from typing import Any
 
 import numpy as np
 
 from projservo_cli.geometry.kinematics import project
 from projservo_cli.laws import CLASSICAL_LAWS, PAPER_LAWS, PROJECTIVE_LAWS, title_of
 from projservo_cli.loop.verdicts import plateau_stretches
-from projservo_cli.records import CORNERS, ByteArray, FloatArray, IncidenceHistory, IntArray, Trace
+from projservo_cli.records import (
+    CORNERS,
+    ByteArray,
+    FloatArray,
+    IncidenceHistory,
+    IntArray,
+    RecordedFrames,
+    Trace,
+)
 from projservo_cli.report import panels, style
 from projservo_cli.report.figure_inputs import DIRECT, Data, Driven, ReportData, percent, registered, title
 from projservo_cli.task.face import cyclic_order
@@ -264,16 +273,14 @@ _FAINT_FACE = style.line(style.GREY, width=0.7, label="face at the start and at 
 
 
 def frames_of_run(
-    trace: Trace, selected: IntArray | None = None, width: int | None = None
-) -> list[ByteArray] | None:
-    """Frames (k, height, width) of each view of a run, of those kept the selected (k,); None without any.
+    kept: RecordedFrames, selected: IntArray | None = None, width: int | None = None
+) -> list[ByteArray]:
+    """Frames (k, height, width) of each view of a run, of those kept the selected (k,).
 
     width : px that they need not exceed, at which they are read faster and smaller.
     """
     from PIL import Image
 
-    if (kept := trace.frames) is None:
-        return None
     ends = np.cumsum(kept.frame_size).reshape(kept.frame_size.shape)
     films = []
     for ends_of_view, sizes in zip(ends.T, kept.frame_size.T, strict=True):
@@ -288,9 +295,13 @@ def frames_of_run(
     return films
 
 
-def _runs_with(report_data: Driven | ReportData, part: str) -> list[tuple[str, Trace]]:
-    """Names and traces of the runs that have a part, first the direct laws."""
-    runs = [run for run in report_data.traces.items() if getattr(run[1], part) is not None]
+def _runs_with(report_data: Driven | ReportData, part: str) -> list[tuple[str, Trace, Any]]:
+    """Names and traces of the runs that have a part, which is the third, first the direct laws."""
+    runs = [
+        (name, trace, found)
+        for name, trace in report_data.traces.items()
+        if (found := getattr(trace, part)) is not None
+    ]
     return sorted(runs, key=lambda run: run[0] not in PROJECTIVE_LAWS)
 
 
@@ -304,13 +315,10 @@ def _data_frames(report_data: Driven | ReportData) -> Data:
     The run is one of those with frames.
     """
     order = cyclic_order(report_data.plan.A)
-    name, trace = _runs_with(report_data, "frames")[0]
-    kept = trace.frames
-    assert kept is not None
+    name, trace, kept = _runs_with(report_data, "frames")[0]
     half = np.abs(trace.image_error[kept.frame_index] - 0.5 * trace.image_error[0])
     selected = np.array([0, int(np.nanargmin(half)), len(half) - 1])
-    frames = frames_of_run(trace, selected)
-    assert frames is not None
+    frames = frames_of_run(kept, selected)
     return {
         "run": np.array(f"{title(name)}, {trace.verdict}"),
         "instant": kept.frame_index[selected],
@@ -389,9 +397,7 @@ def _data_incidences(report_data: ReportData | Driven) -> Data:
 
     Motions of a sequence have separate incidences: those of other runs are NaN.
     """
-    name, drawn_parts = _runs_with(report_data, "of_incidences")[0]
-    there = drawn_parts.of_incidences
-    assert there is not None
+    name, drawn_parts, there = _runs_with(report_data, "of_incidences")[0]
     result: Data = {
         "run": np.array(title(name)),
         "free_dof": np.array(-1 if there.free_dof is None else there.free_dof),
@@ -555,7 +561,6 @@ def _data_object(report_data: ReportData | Driven) -> Data:
         "object": np.array([one.object_name for one in plan.carried]),
     }
     for one in plan.carried:
-        assert one.s_object_taught is not None
         data |= {
             f"marker_{one.object_name}": one.object_marker,
             f"taught_{one.object_name}": one.s_object_taught,
@@ -566,8 +571,7 @@ def _data_object(report_data: ReportData | Driven) -> Data:
 
 
 def _carried(report_data: Driven | ReportData) -> bool:
-    carried = report_data.plan.carried
-    return bool(carried) and all(one.s_object_taught is not None for one in carried)
+    return bool(report_data.plan.carried)
 
 
 @registered(

@@ -4,9 +4,9 @@ import copy
 import math
 from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -53,6 +53,23 @@ _RETREAT = 10  # periods by which an arm goes back if the object of its goal mov
 _NOT_DRIVEN: Any = None  # replaces the results of a run
 
 
+class PlannedCourse(NamedTuple):
+    """How a run takes to its plan."""
+
+    mode: str = REGULATE  # of the run
+    planned_s: float | None = None  # when the plan that it follows arrives, s
+    unplanned: str = ""  # why it goes without the plan that it was to follow
+
+
+class Brought(NamedTuple):
+    """Objects of the caller of a run."""
+
+    factory: Callable[[Any], Any] | None = None  # makes the law of its setup; None for the law of its name
+    robot: Any = None  # an object of the contract; None for the configured one
+    blind: bool = False  # whether a robot may move although cameras show no marker of the calibration
+    session: Session | None = None  # connection to the robot; None to open one
+
+
 @dataclass(eq=False)
 class LawRun:
     """A run of a law: made, driven to its verdict, and summed up."""
@@ -61,14 +78,9 @@ class LawRun:
     # plan of the task, or the joint motions (2, n) of its rotations if that is enough
     plan: Plan | FloatArray
     law: str
-    mode: str = REGULATE  # law, mode: of the run
-    planned_s: float | None = None  # when the plan that it follows arrives, s
-    unplanned: str = ""  # why it goes without the plan that it was to follow
+    course: PlannedCourse = field(default_factory=PlannedCourse)
     believed: Model | None = None  # robot and rig as the law has them; None for the default of its kind
-    factory: Callable[[Any], Any] | None = None  # makes the law of its setup; None for the law of its name
-    robot: Any = None  # an object of the contract; None for the configured one
-    blind: bool = False  # whether a robot may move although cameras show no marker of the calibration
-    session: Session | None = None  # connection to the robot; None to open one
+    brought: Brought = field(default_factory=Brought)
     # As it ended.
     verdict: str = ""
     why: Finding | None = None  # reason why it was held, disturbed or failed, if it was
@@ -105,7 +117,7 @@ class LawRun:
     @property
     def replans(self) -> bool:
         """Whether the law goes its own way instead of following the plan."""
-        return self.mode == REGULATE or bool(self.unplanned)
+        return self.course.mode == REGULATE or bool(self.course.unplanned)
 
     @property
     def is_guided(self) -> bool:
@@ -146,12 +158,14 @@ class LawRun:
         assert contract is not None
         scenario.world.require_ready()
         controller = self.controller()
-        shared, plan = self.session, self.plan if isinstance(self.plan, Plan) else None
+        shared, plan = self.brought.session, self.plan if isinstance(self.plan, Plan) else None
         # The matrices of a frame are small: a second thread costs more than it gives.
         with threadpool_limits(limits=1), nullcontext(shared) if shared else Session() as session:
-            driven = connected_robot(scenario, self.law, session, self.robot, plan)
+            driven = connected_robot(scenario, self.law, session, self.brought.robot, plan)
             driven.stops = shared is None
-            self.unseen = scenario.world.begin(driven, contract, scenario.ends.q_start, blind=self.blind)
+            self.unseen = scenario.world.begin(
+                driven, contract, scenario.ends.q_start, blind=self.brought.blind
+            )
             driven.begin()
             driven.retreats = _RETREAT
             self.in_python(controller, driven, StallMonitor(driven, scenario.termination))
@@ -165,7 +179,7 @@ class LawRun:
             assert isinstance(self.plan, Plan)
             follow, searches = partial(self._task, law.law.model), scenario.servo.laws.max_replan_attempts
             replanner = PathReplanner(scenario, self.plan)
-            blind, limits = self.blind or scenario.world.moves_unseen, scenario.termination
+            blind, limits = self.brought.blind or scenario.world.moves_unseen, scenario.termination
             execution = ExecutionMonitor(law, follow, replanner, searches, limits, stall, blind=blind)
         code, self.steps, self.log = run_in_python(
             law,
@@ -243,7 +257,7 @@ class LawRun:
         model, shown = ImageModel.of(scenario.world.calibration), (ends.s_start, ends.s_star)
         # A copy: no law may write to the arrays of another.
         setup = copy.deepcopy(LawSetup(model, face, *shown, self.plan, gains, gains.period))
-        factory = self.factory or plugins.find("law", self.law)
+        factory = self.brought.factory or plugins.find("law", self.law)
         law = plugins.called("law", self.law, factory, (setup,), {})
         return PluginLaw(
             law, f"law {self.law}", scenario.world.min_views, scenario.termination.image_error_px

@@ -70,7 +70,7 @@ def trace_of(run: LawRun) -> Trace:
     scenario, log, steps = run.scenario, run.log, run.steps
     rows = steps + 1
     # A law that follows a plan measures the distance to the plan, not to the goal.
-    remaining = _left(log, steps) if run.mode == REGULATE else (None, None)
+    remaining = _left(log, steps) if run.course.mode == REGULATE else (None, None)
     joint, driven = int(log.events[2]), run.driven
     dark = _blind_view(log.s[:rows], scenario.world.view, WINDOW) if driven and arrived(run.verdict) else ()
     lost = [run.unseen] if run.unseen else dark
@@ -91,10 +91,10 @@ def trace_of(run: LawRun) -> Trace:
         untested=text((*untested, *lost), run.setup),
         overruns=None if driven is None else driven.steered.overruns,
         following=PlanFollowing(
-            mode=run.mode,
-            planned_s=run.planned_s,
+            mode=run.course.mode,
+            planned_s=run.course.planned_s,
             replan_attempts=len(run.replannings),
-            unplanned=run.unplanned,
+            unplanned=run.course.unplanned,
         ),
         errors=RunErrors(
             remaining_translation=remaining[0],

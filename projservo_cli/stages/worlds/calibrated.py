@@ -75,7 +75,7 @@ class CalibratedWorld:
     @property
     def m(self) -> int:
         """Number of markers on the face."""
-        return len(self.inputs.face)
+        return len(self.inputs.markers.face)
 
     @property
     def min_views(self) -> int:
@@ -141,7 +141,7 @@ class CalibratedWorld:
             if vector is not None and len(vector.joints) != n:
                 raise InputError(f"task.{key}: {len(vector.joints)} values for {n} joints")
         numbers = self.numbers[: self.m], self.numbers[self.m :]
-        how, at = (self.inputs.center, self.view), self.inputs.q_current
+        how, at = (self.inputs.markers.center, self.view), self.inputs.q_current
         return task_images(task, self.joints.types, numbers, how, self._predicted, self._turned, q_current=at)
 
     def _predicted(self, q: FloatArray, key: str) -> FloatArray:
@@ -155,12 +155,12 @@ class CalibratedWorld:
 
     def _turned(self, q: FloatArray) -> FloatArray:
         """Joints (n,) of a goal that is a turn from joints (n,)."""
-        P = self.inputs.cameras_at(q)
-        if self.inputs.arm is None or P is None:
+        P = self.inputs.described.cameras_at(q)
+        if self.inputs.described.arm is None or P is None:
             raise InputError(
                 "task.goal.roll_deg needs the model of the robot and its rig: give joints or images instead"
             )
-        return turned(self.inputs.required_task.goal, self.inputs.arm, P, q)
+        return turned(self.inputs.required_task.goal, self.inputs.described.arm, P, q)
 
     def true_ends(self, images: TaskImages, q_goal: FloatArray | None) -> Ends:
         """Return the true poses of the tool at the ends of a task; NaN if unknown."""
@@ -214,14 +214,14 @@ class CalibratedWorld:
 
     def metric_model(self, law: str) -> Model:
         """Return the metric model that a classical law is given; InputError if none is described."""
-        arm = self.inputs.arm
-        P = None if arm is None else self.inputs.cameras_at(arm.q_reference)
+        arm = self.inputs.described.arm
+        P = None if arm is None else self.inputs.described.cameras_at(arm.q_reference)
         if arm is None or P is None:
             raise InputError(
                 f"{law} is given the metric model of robot and rig: set robot and rig, or leave it out of "
                 "control.laws"
             )
-        return arm.model(P, on_tool=self.inputs.mount == TOOL)
+        return arm.model(P, on_tool=self.inputs.described.mount == TOOL)
 
     @property
     def knows_limits(self) -> bool:
@@ -331,7 +331,7 @@ class CalibratedWorld:
 
         reached : poses (k, 4, 4) or joints (k, n) that a robot reports; goal_joints : (g, n) at the goal.
         """
-        arm, goal, unknown = self.inputs.arm, np.full((4, 4), np.nan), np.full((len(H), 3), np.nan)
+        arm, goal, unknown = self.inputs.described.arm, np.full((4, 4), np.nan), np.full((len(H), 3), np.nan)
         if reached is None:
             return TruePoses(H * np.nan, goal, unknown, {})
         if arm is not None and len(goal_joints):
@@ -347,8 +347,8 @@ class CalibratedWorld:
 
 def observed_numbers(inputs: PlanInputs, calibration: Calibration) -> tuple[int, ...]:
     """Numbers of the markers that a robot which is not simulated observes, in its order."""
-    numbers = tuple(calibration.marker.tolist()) if inputs.known is None else inputs.known
-    for number in inputs.face:
+    numbers = tuple(calibration.marker.tolist()) if inputs.markers.known is None else inputs.markers.known
+    for number in inputs.markers.face:
         if number not in numbers:
             raise InputError(f"markers.face: marker {number} is not among those observed, {[*numbers]}")
     return numbers

@@ -83,7 +83,9 @@ class SimulatedWorld(CalibratedWorld):
         """Return start and goal without noise, and the joints (n,) at the goal, if they are known."""
         at = None if self.inputs.q_current is None else tuple(self.inputs.q_current.tolist())
         pins = self.numbers[self.m :]
-        return _simulated_ends(task, self.joints.types, self.truth, pins, self.inputs.center, current=at)
+        return _simulated_ends(
+            task, self.joints.types, self.truth, pins, self.inputs.markers.center, current=at
+        )
 
     def true_ends(self, images: TaskImages, q_goal: FloatArray | None) -> Ends:
         """Return the true poses of the tool at start and goal, which may be carried along, then displaced."""
@@ -266,7 +268,7 @@ class RenderedWorld(SimulatedWorld):
             at_first = carriers[0].at_first if carriers else None
             goal, there = self._frames(at_first or self.scene, q_taught, (seed, GOAL_FRAMES))
         else:
-            deviations = given.deviations(self.numbers, self.inputs.face, self.view)
+            deviations = given.deviations(self.numbers, self.inputs.markers.face, self.view)
             goal, there = images.s_star, np.array(deviations)
         sigma = np.fmax(sigma, there)
         start = self._with_face("task.start", start, images.q_start, images.q_start)
