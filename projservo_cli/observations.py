@@ -47,7 +47,10 @@ class Observations(Displayable, Observation):
     moving, t_q, t_view, sigma : as in [the run file]; None where unknown.
     joint_types : one letter a joint, R or P.
     image_size : width and height, px, of all images or of one each; None where unknown.
-    noise : what is known of it: ``noise_px``, ``joint_noise`` and ``exact`` are its fields too.
+    noise_px : standard deviation of a coordinate, px; None to estimate it.
+    joint_noise : rms of joint readings less true joints, rad (prismatic × 0.3 m/rad); None to estimate it.
+    exact : whether pixel noise is their only error, so that χ² decides against ``noise_px``.
+    noise : these three, as ``px``, ``joint`` and ``alone``.
     source : ``simulated`` or ``recorded``.
     seed : seed of the random starts of a calibration.
     mount : ``world`` for cameras that watch the tool, ``tool`` for cameras on it.
