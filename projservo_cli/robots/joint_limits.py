@@ -7,7 +7,8 @@ import numpy as np
 
 from projservo_cli.calibration.detections import per_rad
 from projservo_cli.findings import REFUSES, Finding, Subject
-from projservo_cli.records import FloatArray, JointLimits
+from projservo_cli.records import FloatArray, JointLimits, WorkFailed
+from projservo_cli.robots.contract import Bounds
 
 
 class Joints(NamedTuple):
@@ -33,3 +34,18 @@ def limit_passed(q: FloatArray, limits: JointLimits, types: str) -> Finding | No
         ends = (Finding("range", amount=limits.lower[i], limit=limits.upper[i], unit=unit),)
         return Finding("limit_passed", REFUSES, joint, q[i], unit=unit, others=ends)
     return None
+
+
+def require_no_turn_off(bounds: Bounds, q: FloatArray) -> None:
+    """Refuse joints (n,) of which one reads a whole turn off: it would turn back by that, with its cables."""
+    lower, upper = bounds.limits.lower, bounds.limits.upper
+    beyond = ((q < lower) | (q > upper)) & np.isfinite(upper - lower)
+    for i in np.flatnonzero(beyond).tolist():
+        turns = np.round((q[i] - 0.5 * (lower[i] + upper[i])) / (2.0 * np.pi))
+        if bounds.units[i] == "m" or not lower[i] <= q[i] - 2.0 * np.pi * turns <= upper[i]:
+            continue
+        limits = f"{bounds.text(i, lower[i])} to {bounds.text(i, upper[i])}"
+        raise WorkFailed(
+            f"nothing was moved: joint {i + 1} reads {bounds.text(i, q[i])}, a whole turn beyond its limits "
+            f"{limits}: home it again where it stands"
+        )

@@ -12,10 +12,12 @@ from typing import NamedTuple
 import numpy as np
 
 from projservo_cli.calibration.time_offset import is_repeated_frame
-from projservo_cli.records import BoolArray, FloatArray, WorkFailed
+from projservo_cli.records import BoolArray, Calibration, FloatArray, InputError, WorkFailed
 
 # Deviation of an unknown delay, and of a single frame if no calibration gives it, s.
 _UNKNOWN_S, _JITTER_S = 0.3, 0.012
+# Minimum deviation of a delay and of single frames, s; width of a 95 % interval in deviations.
+_LEAST_JITTER_S, _INTERVAL = 0.002, 3.92
 # Readings that are kept, and how far beyond the last one joints are taken to move on, s.
 _KEPT, _AHEAD_S = 256, 0.1
 # Delays that are reckoned with while little is known, s.
@@ -84,6 +86,28 @@ class DelayPrior(NamedTuple):
     def unknown(cls, views: int) -> "DelayPrior":
         """Return the prior of a number of views without knowledge."""
         return cls(np.zeros(views), np.full(views, _UNKNOWN_S), np.full(views, _JITTER_S))
+
+    @classmethod
+    def of(cls, calibration: Calibration, given: Sequence[float | None] | None) -> "DelayPrior":
+        """Return the prior of a calibration: given delays of all views, s, calibrated ones, or wide.
+
+        Raises InputError if a view has none among given ones.
+        """
+        view = calibration.view
+        known = cls.unknown(len(view))
+        if (found := calibration.time_offset) is not None:
+            sigma = np.maximum(
+                np.ptp(found.time_offset_interval_s, axis=1) / _INTERVAL, 0.5 * _LEAST_JITTER_S
+            )
+            jitter = np.maximum(found.time_offset_jitter_s, _LEAST_JITTER_S)
+            known = cls(found.time_offset_s.copy(), sigma, jitter)
+        if given is None:
+            return known
+        if missing := [name for name, delay in zip(view, given, strict=True) if delay is None]:
+            raise InputError(
+                f"plant.time_offset_s: names no {', '.join(missing)}: give their numbers, or others"
+            )
+        return known._replace(mean=np.array(given, float), sigma=np.zeros(len(view)))
 
 
 class _Frames(NamedTuple):

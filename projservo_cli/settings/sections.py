@@ -22,7 +22,8 @@ from pydantic import (
 from pydantic_core import PydanticCustomError
 
 from projservo_cli.image_size import view_named
-from projservo_cli.records import FARTHEST_M, VIEW_NAME, VIEWS, FloatArray
+from projservo_cli.records import VIEW_NAME, VIEWS, FloatArray
+from projservo_cli.settings.units import of_another_unit
 
 Number = Annotated[float, Strict()]
 Vector2 = tuple[Number, Number]
@@ -197,29 +198,12 @@ class Root(Section):
         return ()
 
 
-# Largest value of a key by its name: of lengths such as those on the tool, m, and of short times, s.
-_LARGEST = (
-    (re.compile(r"(tag_)?size_m|positions_m"), 2.0, "millimetres"),
-    (re.compile(r"\w+_m"), FARTHEST_M, "millimetres"),
-    (re.compile(r"(period|settle|time_offset|camera_latency|max_servo_lag|max_age)_s"), 10.0, "milliseconds"),
-)
-
-
-def _of_another_unit(key: str, value: Any) -> str:
-    """Tell that a length or a time looks like one in another unit; empty if not."""
-    most, unit = next(((most, unit) for name, most, unit in _LARGEST if name.fullmatch(key)), (math.inf, ""))
-    each = [inner for _, inner in value] if isinstance(value, Section) else value
-    largest = max((abs(x) for x in np.ravel(each) if isinstance(x, float)), default=0.0) if unit else 0.0
-    return (
-        f"{largest:g} is more than {most:g}: it looks like {unit}; divide by 1000" if largest > most else ""
-    )
-
-
 def _contradictions(parts: Iterable[tuple[Any, Any]], path: tuple[str | int, ...] = ()) -> Iterator[Note]:
     """Those of all sections among some values by their keys, and of the sections in these."""
     for key, part in parts:
         here = (*path, key)
-        if what := _of_another_unit(str(key), part):
+        each = [inner for _, inner in part] if isinstance(part, Section) else part
+        if what := of_another_unit(str(key), each):
             yield here, what
         if isinstance(part, Section):
             yield from ((here + at, what) for at, what in part.contradictions())

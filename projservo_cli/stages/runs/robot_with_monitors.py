@@ -8,19 +8,15 @@ import numpy as np
 from projservo_cli.calibration.prediction import predict
 from projservo_cli.monitoring.image_monitor import ImageMonitor
 from projservo_cli.monitoring.innovation_tests import WINDOW
-from projservo_cli.records import Calibration, InputError, Plan
+from projservo_cli.records import Calibration, Plan
 from projservo_cli.robots.contract import Robot
 from projservo_cli.robots.latency_compensation import DrivenRobot, Known
 from projservo_cli.robots.latency_estimation import DelayPrior
 from projservo_cli.robots.object_watch import ObjectWatch
 from projservo_cli.robots.session import Session
-from projservo_cli.settings.disturbance import EachView
 from projservo_cli.stages.scenario import RunScenario
 from projservo_cli.stages.stage_inputs import Contract
 from projservo_cli.task.displaced_object import images_by_motion
-
-# Minimum deviation of a delay and of single frames, s; width of a 95 % interval in deviations.
-_LEAST_JITTER_S, _INTERVAL = 0.002, 3.92
 
 
 def connected_robot(
@@ -61,7 +57,7 @@ def connected_robot(
 
 def _known_of(scenario: RunScenario, contract: Contract, calibration: Calibration, law: str) -> Known:
     """Return the knowledge of a robot and its images before a law drives it."""
-    numbers = scenario.world.observed
+    numbers, views, given = scenario.world.observed, calibration.view, contract.time_offset_s
     return Known(
         predicted=partial(predict, calibration),
         visible=np.array([numbers.index(number) for number in scenario.numbers_of(law)]),
@@ -69,25 +65,7 @@ def _known_of(scenario: RunScenario, contract: Contract, calibration: Calibratio
         sigma_px=scenario.world.noise_px,
         sigma_scale=calibration.sigma_scale or 1.0,
         sigma_q=scenario.world.joints.length_of(math.degrees(calibration.sigma_q or 0.0)),
-        delays=_delays_of(contract.time_offset_s, calibration),
+        delays=DelayPrior.of(calibration, None if given is None else [given.of(name) for name in views]),
         timeout_s=contract.timeout_s,
         max_force_n=scenario.servo.stop.max_force_n,
     )
-
-
-def _delays_of(given: EachView | None, calibration: Calibration) -> DelayPrior:
-    """Return the prior of the delays of all views: given, calibrated, or wide."""
-    view = calibration.view
-    known = DelayPrior.unknown(len(view))
-    if (found := calibration.time_offset) is not None:
-        sigma = np.maximum(np.ptp(found.time_offset_interval_s, axis=1) / _INTERVAL, 0.5 * _LEAST_JITTER_S)
-        jitter = np.maximum(found.time_offset_jitter_s, _LEAST_JITTER_S)
-        known = DelayPrior(found.time_offset_s.copy(), sigma, jitter)
-    if given is not None:
-        if missing := [name for name in view if given.of(name) is None]:
-            raise InputError(
-                f"plant.time_offset_s: names no {', '.join(missing)}: give their numbers, or others"
-            )
-        mean = np.array([given.of(name) for name in view], float)
-        known = known._replace(mean=mean, sigma=np.zeros(len(view)))
-    return known

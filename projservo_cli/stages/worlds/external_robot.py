@@ -10,10 +10,10 @@ from projservo_cli.detection.finders import finder_of
 from projservo_cli.findings import REFUSES, Finding, Subject
 from projservo_cli.hardware.camera_robot import Arm, CameraRobot
 from projservo_cli.passwords import MASK
-from projservo_cli.records import FloatArray, InputError, WorkFailed
+from projservo_cli.records import FloatArray, InputError
 from projservo_cli.robots.contract import Bounds, PluginRobot, Reading, Robot
 from projservo_cli.robots.flange_robot import by_joints
-from projservo_cli.robots.joint_limits import Joints
+from projservo_cli.robots.joint_limits import Joints, require_no_turn_off
 from projservo_cli.robots.pacing import Steered
 from projservo_cli.robots.session import Session
 from projservo_cli.robots.standstill import STILL, Standstill, at_rest
@@ -106,21 +106,6 @@ def takes_limits(own: OwnRobot) -> bool:
     return "limits" not in own.options and plugins.takes(own.target, "limits")
 
 
-def _require_no_turn_off(bounds: Bounds, q: FloatArray) -> None:
-    """Refuse joints (n,) of which one reads a whole turn off: it would turn back by that, with its cables."""
-    lower, upper = bounds.limits.lower, bounds.limits.upper
-    beyond = ((q < lower) | (q > upper)) & np.isfinite(upper - lower)
-    for i in np.flatnonzero(beyond).tolist():
-        turns = np.round((q[i] - 0.5 * (lower[i] + upper[i])) / (2.0 * np.pi))
-        if bounds.units[i] == "m" or not lower[i] <= q[i] - 2.0 * np.pi * turns <= upper[i]:
-            continue
-        limits = f"{bounds.text(i, lower[i])} to {bounds.text(i, upper[i])}"
-        raise WorkFailed(
-            f"nothing was moved: joint {i + 1} reads {bounds.text(i, q[i])}, a whole turn beyond its limits "
-            f"{limits}: home it again where it stands"
-        )
-
-
 def path_to(
     robot: Steered, q: FloatArray, settle_s: float, what: str, fit: Callable[[Reading], None] | None = None
 ) -> Iterator[Reading]:
@@ -134,7 +119,7 @@ def path_to(
     """
     bounds, still = robot.robot.bounds, Standstill(settle_s)
     begun = robot.observe().q
-    _require_no_turn_off(bounds, begun)
+    require_no_turn_off(bounds, begun)
     if fit is not None:
         fit(robot.reading)
     while (gap := q - robot.target).any():
