@@ -10,7 +10,8 @@ import numpy as np
 from projservo_cli.calibration.checks.validation import of_views
 from projservo_cli.detection.finders import MIN_CELL, BoardFinder, Corners, Finder, TagFinder, dictionaries
 from projservo_cli.findings import LIMITS, NOTE, REFUSES, Finding, Subject
-from projservo_cli.hardware.camera_robot import View, exposure_of
+from projservo_cli.hardware.camera_robot import View
+from projservo_cli.hardware.exposure import exposure_of
 from projservo_cli.hardware.video_cameras import VideoCamera, stable_name
 from projservo_cli.records import CORNERS, BoolArray, ByteArray, FloatArray, JointLimits, Observation
 
