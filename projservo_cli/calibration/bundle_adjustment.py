@@ -22,12 +22,13 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import expm, lu_factor, lu_solve
+from scipy.linalg import block_diag, expm, lu_factor, lu_solve
 from scipy.sparse import csr_array
 
 from projservo_cli.calibration.detections import RAYLEIGH, Detections, cauchy_weights, per_block
 from projservo_cli.calibration.prediction import CAMERA, Parameters, image_points
 from projservo_cli.geometry.displacements import cross_matrix
+from projservo_cli.geometry.invariant_forms import UPPER, intrinsics_derivative, intrinsics_of
 from projservo_cli.geometry.lens import TERMS, distort
 from projservo_cli.records import BoolArray, Errors, FloatArray, IntArray
 
@@ -90,6 +91,13 @@ def moved_operators(params: Parameters) -> list[FloatArray]:
     return [B @ H_hat - H_hat @ B for B, H_hat in zip(_generators(params), params.H_hat, strict=True)]
 
 
+class StatedIntrinsics(NamedTuple):
+    """Intrinsics that are known but for their deviations, over pixel noise, of the entries ``UPPER``."""
+
+    K: FloatArray  # (V, 3, 3) px
+    spread: FloatArray  # (V, 5) infinite where an entry is not known
+
+
 @dataclass(frozen=True, eq=False)
 class LeastSquares:
     """Detections to fit and the order of the parameters: cameras, joints, lenses, curve, boards, markers.
@@ -111,6 +119,7 @@ class LeastSquares:
     tau: FloatArray | None = None
     curve_terms: int = 0  # number of terms of the curve of the joints
     by_twist: FloatArray | None = None  # (K, n, n) of ``q`` by a twist of the flange; None for joints
+    stated: StatedIntrinsics | None = None  # intrinsics as priors, where there are any
 
     @classmethod
     def of(
@@ -143,7 +152,8 @@ class LeastSquares:
 
     def alike(self, detections: Detections) -> "LeastSquares":
         """Problem of the same parameters but for markers, of other detections, without noise of joints."""
-        return LeastSquares.of(detections, self.q_reference, self.lens_terms, self.curve_terms)
+        there = LeastSquares.of(detections, self.q_reference, self.lens_terms, self.curve_terms)
+        return dataclasses.replace(there, stated=self.stated)
 
     def joints(self, params: Parameters) -> FloatArray:
         """Readings (K, n) from the reference, rad or m, with the offsets if joint readings have noise."""
@@ -158,6 +168,24 @@ class LeastSquares:
         if self.tau is None:
             return np.zeros((0, len(self.q_reference)))
         return np.zeros_like(self.q) if params.offsets is None else np.asarray(params.offsets / self.tau)
+
+    def departure(self, params: Parameters) -> FloatArray:
+        """Entries (V, 5) of intrinsics less those stated, over their spread, px; (0, 5) without any."""
+        if self.stated is None:
+            return np.zeros((0, 5))
+        return np.asarray((intrinsics_of(params.P) - self.stated.K)[:, *UPPER] / self.stated.spread)
+
+    def departure_derivative(self, params: Parameters) -> FloatArray:
+        """Derivatives (5 V, shared) of ``departure`` by the shared parameters."""
+        result = np.zeros((self.departure(params).size, self.shared))
+        if self.stated is not None:
+            by_camera = intrinsics_derivative(params.P) / self.stated.spread[..., None]
+            result[:, : params.P.size] = block_diag(*by_camera)
+        return result
+
+    def prior_squares(self, params: Parameters) -> float:
+        """Sum of the squares of ``strain`` and ``departure``, px²."""
+        return float((self.strain(params) ** 2).sum() + (self.departure(params) ** 2).sum())
 
     def with_noise(self, tau: FloatArray | None) -> "LeastSquares":
         """Replace the noise of joints (n,) over pixel noise, rad/px or m/px."""
@@ -176,8 +204,9 @@ class LeastSquares:
 
     @property
     def free(self) -> int:
-        """Number of parameters that move images, those of the frame included."""
-        return self.size - 3 * int(np.count_nonzero(self.detections.on_board))
+        """Number of parameters that move images, those of the frame included, less what is stated of them."""
+        known = 0 if self.stated is None else int(np.isfinite(self.stated.spread).sum())
+        return self.size - 3 * int(np.count_nonzero(self.detections.on_board)) - known
 
     @property
     def by_pose(self) -> bool:
@@ -509,13 +538,15 @@ class _Expansion:
         self.root, self.first = np.sqrt(weight), problem.size - len(min_scale)
         m, offsets = len(params.M), 0 if problem.tau is None else problem.q.size
         self.by_pose = problem.by_pose
-        self.strain = problem.strain(params)
+        self.strain, self.departure = problem.strain(params), problem.departure(params).ravel()
+        self.stated = problem.departure_derivative(params)
         self.known: list[_Part] = []
         s, size = problem.shared, 3 * m if self.by_pose else offsets
         blocks, width = problem.q.shape if self.by_pose else (m, 3)
         gauge = problem.gauge(params) if self.first == 0 else np.zeros((problem.size, 0))
         self.ties = gauge.shape[1]
         A, C = np.zeros((s + size, s + size)), np.zeros((blocks, width, s + size + self.ties))
+        A[:s, :s] = self.stated.T @ self.stated
         D = np.zeros((blocks, width, width))
         for part in self._parts():
             self._add(part, A, C, D)
@@ -602,22 +633,22 @@ class _Expansion:
         descent, count = self.solved(damping), len(self.scale)
         if descent is None:
             return None
-        velocity = descent(self.residual, self.strain)
+        velocity = descent(self.residual, self.strain, self.departure)
         if not np.isfinite(velocity).all():
             return None
         probe = self.problem.residual(self.problem.retract(self.params, _PROBE * self._whole(velocity)))
         bend = (2.0 / _PROBE) * ((probe - self.residual) / _PROBE - self.change(self._whole(velocity)))
         if not np.isfinite(bend).all():
             return None
-        acceleration = descent(bend, np.zeros_like(self.strain))
+        acceleration = descent(bend, np.zeros_like(self.strain), np.zeros_like(self.departure))
         if not np.linalg.norm(acceleration[:count]) <= _BEND * np.linalg.norm(velocity[:count]):
             return None
         return self._whole(velocity + 0.5 * acceleration)
 
-    def solved(self, damping: float) -> Callable[[FloatArray, FloatArray], FloatArray] | None:
-        """Solver that maps a change (V, N, 2) of images and strains (K, n) to the step undoing it, in units.
+    def solved(self, damping: float) -> Callable[[FloatArray, FloatArray, FloatArray], FloatArray] | None:
+        """Solver that maps a change (V, N, 2) of images, strains (K, n) and departures (5 V,) to a step.
 
-        None if the normal matrix is singular.
+        The step undoes them, in units. None if the normal matrix is singular.
         """
         A, D = self.A.copy(), self.D + (0.0 if self.by_pose else damping) * np.eye(self.D.shape[1])
         A[np.arange(len(self.damped)), np.arange(len(self.damped))] += damping * self.damped
@@ -629,9 +660,9 @@ class _Expansion:
         except np.linalg.LinAlgError:
             return None
 
-        def descent(change: FloatArray, strain: FloatArray) -> FloatArray:
+        def descent(change: FloatArray, strain: FloatArray, departure: FloatArray) -> FloatArray:
             """Step of parameters in units, then of offsets in units of tau."""
-            kept, gone = self._gradient(change, strain)
+            kept, gone = self._gradient(change, strain, departure)
             left = np.linalg.solve(root, gone[..., None])
             x = -lu_solve(factor, kept - flat.T @ left.ravel(), check_finite=False)
             y = -np.linalg.solve(root.swapaxes(1, 2), left + (crossed @ x)[..., None])[..., 0]
@@ -639,11 +670,14 @@ class _Expansion:
 
         return descent
 
-    def _gradient(self, change: FloatArray, strain: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _gradient(
+        self, change: FloatArray, strain: FloatArray, departure: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
         """Gradients, in units, by the kept (k,) and the eliminated parameters (b, d)."""
         (kept, gone), problem, first = self.units, self.problem, self.first
         by_kept, by_gone = np.zeros(first + len(self.A)), np.zeros(gone.shape)
         width = 3 if self.by_pose else len(problem.q_reference)
+        by_kept[: problem.shared] = departure @ self.stated
         others = by_kept[problem.shared : first + len(kept)].reshape(-1, width)
         for part in self._parts():
             weighed = self.root[:, part.at, None] * change[:, part.at]
@@ -715,15 +749,16 @@ def minimize(
     for _ in range(max_steps):
         if fresh:
             here = _Expansion(problem, params, residual, weight, scale)
-            scale, cost = here.scale, _cost(weight, residual, problem.strain(params))
+            scale, cost = here.scale, _cost(weight, residual, problem.prior_squares(params))
             fresh = False
         x = here.step(damping)
         if x is not None:
             candidate = problem.retract(params, x)
             new_residual = problem.residual(candidate)
-            new_cost = _cost(weight, new_residual, problem.strain(candidate))
+            new_cost = _cost(weight, new_residual, problem.prior_squares(candidate))
             fresh = bool(np.isfinite(new_cost)) and new_cost <= cost
-            moved = _cost(weight, here.change(x), np.zeros(0))
+            nearer = float(np.square(here.stated @ x[: problem.shared]).sum())
+            moved = _cost(weight, here.change(x), nearer)
             settled = moved <= min_change * max(cost, _MIN_RESIDUAL**2 * float(weight.sum()))
             if fresh and not robust:
                 flat = flat + 1 if cost - new_cost <= _NO_GAIN * cost else 0
@@ -738,7 +773,7 @@ def minimize(
             damping *= 10.0
         if settled or damping > _MAX_DAMPING:
             break
-    return _Fit(params, residual, _cost(weight, residual, problem.strain(params)))
+    return _Fit(params, residual, _cost(weight, residual, problem.prior_squares(params)))
 
 
 def fit_offsets(problem: LeastSquares, params: Parameters) -> Parameters:
@@ -766,6 +801,6 @@ def _weights(residual: FloatArray, rows: BoolArray, robust: bool) -> FloatArray:
     return np.where(rows, cauchy_weights((distance / width) ** 2), 0.0)
 
 
-def _cost(weight: FloatArray, residual: FloatArray, strain: FloatArray) -> float:
-    """Weighted sum of squares of residuals (V, N, 2), plus that of strains (K, n) if any, px²."""
-    return float((weight[..., None] * residual**2).sum()) + float((strain**2).sum())
+def _cost(weight: FloatArray, residual: FloatArray, of_priors: float) -> float:
+    """Weighted sum of squares of residuals (V, N, 2), plus that of priors, px²."""
+    return float((weight[..., None] * residual**2).sum()) + of_priors

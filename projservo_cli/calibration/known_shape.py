@@ -73,7 +73,7 @@ def _unplaced(board: StatedBoard, count: int) -> Finding:
 def _agreeing(free: Solution, boards: Sequence[StatedBoard], expected: Expected) -> Solution | None:
     """Fit with the shapes of boards; None without any, or if the images contradict them."""
     solution = _fitted(free, boards, expected) if boards else None
-    return None if solution is None or _chance(solution, free) < _BY_CHANCE else solution
+    return None if solution is None or chance(solution, free) < _BY_CHANCE else solution
 
 
 def _fitted(free: Solution, boards: Sequence[StatedBoard], expected: Expected) -> Solution | None:
@@ -152,11 +152,11 @@ def _steps(board: StatedBoard, params: Parameters, detections: Detections) -> Fl
     return board_steps(corners[on], params.M[on, :3])
 
 
-def _chance(fixed: Solution, free: Solution) -> float:
-    """Probability that noise alone raises the squares of a fit as much by the shapes of boards."""
+def chance(fixed: Solution, free: Solution) -> float:
+    """Probability that noise alone raises the squares of a fit as much by what is known of its parameters."""
     both = fixed.used & free.used
     of_held, of_free = (
-        float((one.residual[both] ** 2).sum() + (one.problem.strain(one.params) ** 2).sum())
+        float((one.residual[both] ** 2).sum()) + one.problem.prior_squares(one.params)
         for one in (fixed, free)
     )
     more = free.problem.free - fixed.problem.free

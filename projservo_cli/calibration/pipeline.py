@@ -51,6 +51,7 @@ from projservo_cli.calibration.initial.camera_weights import with_own_noise
 from projservo_cli.calibration.initial.epipolar import ImageFrame, ImageGeometry
 from projservo_cli.calibration.initial.initialization import Nominal, Progress, Search
 from projservo_cli.calibration.joint_model import AUTO, Hypothesis, fit_joint_model, hypotheses_of
+from projservo_cli.calibration.known_intrinsics import KnownCameras, with_known_intrinsics
 from projservo_cli.calibration.known_shape import with_known_shapes
 from projservo_cli.calibration.lens_estimation import fit_lens, share_explained, undistorted
 from projservo_cli.calibration.prediction import LENS, along_the_arm
@@ -135,7 +136,7 @@ def calibrate(
     mount: str = WORLD,
     joint_model: str | Sequence[str] | None = None,
     boards: Sequence[StatedBoard] = (),
-    lenses: FloatArray | None = None,
+    cameras: KnownCameras | None = None,
     fitted: Callable[[Solution, float], None] | None = None,
     progress: Progress = lambda what, done, total: None,
 ) -> Calibration:
@@ -163,7 +164,8 @@ def calibrate(
         show, or some of ``CURVES``, of all joints or of one, as ``scale:2``; None where joints are as they
         read.
     boards : boards whose corners are markers; their shape is used unless the images contradict it.
-    lenses : (V, 5) known lenses of the views; None where they are ideal, or estimated.
+    cameras : known cameras; their lenses are taken, and their intrinsics are priors unless the images
+        contradict them.
     fitted : called with the solution of ``bundle_adjustment`` and its noise, px.
     progress : called with the current task of ``bundle_adjustment``, how much of it is done, and its total.
 
@@ -189,7 +191,7 @@ def calibrate(
         raise InputError(f"joint noise {joint_noise!r}: give a number that is not negative, or none")
     if mount not in (WORLD, TOOL):
         raise InputError(f"mount {mount!r}: choose {WORLD} or {TOOL}")
-    if lens and lenses is not None:
+    if lens and cameras is not None:
         raise InputError("lenses are known and to be estimated (--intrinsics, --lens): leave one out")
     if mount == TOOL and init is not None:
         raise InputError("cameras on the tool are calibrated from images alone: leave out init")
@@ -206,7 +208,7 @@ def calibrate(
         require_enough_poses(whole)
         if image_size is not None:
             _require_inside(whole, image_size, _LENS_STRAYS if lens else _STRAYS)
-        whole = undistorted(whole, lenses)
+        whole = undistorted(whole, None if cameras is None else cameras.lens)
         require_images(whole, sigma_px)
         whole = with_best_pair(whole)
         detections = whole.of_pair()
@@ -222,7 +224,7 @@ def calibrate(
         problem = LeastSquares.of(detections, detections.reference())
         search = Search(problem, epipolar, of_pair, rng, progress, joint_noise)
         limit = MAX_PREDICTED * float(frame.size.max()) if max_predicted_px is None else max_predicted_px
-        asked = lens, init, curves, boards
+        asked = lens, init, curves, boards, cameras
         solution, expected, result = _maximum_likelihood(search, whole, frame, expect, asked, limit)
         if of_still:
             still_too = np.column_stack([numbers, np.full(len(numbers), WHY_LOST.index("still"))])
@@ -232,8 +234,8 @@ def calibrate(
         seconds = time.perf_counter() - begin
         if fitted is not None:
             fitted(solution, expected.noise_px(solution))
-        if lenses is not None:
-            result = changed(result, lens=lenses)
+        if cameras is not None:
+            result = changed(result, lens=cameras.lens)
         if mount == TOOL:
             result = along_the_arm(result)
         result = with_time_offset(result, observation)
@@ -266,17 +268,18 @@ def _maximum_likelihood(
     whole: Detections,
     frame: ImageFrame,
     expect: Callable[[ImageGeometry], Expected],
-    asked: tuple[bool, Nominal | None, list[Hypothesis] | None, Sequence[StatedBoard]],
+    asked: tuple[bool, Nominal | None, list[Hypothesis] | None, Sequence[StatedBoard], KnownCameras | None],
     limit_px: float,
 ) -> tuple[Solution, Expected, Calibration]:
     """Maximum-likelihood solution, its expected noise and its record.
 
     start : search by the pair of views; whole, frame : detections and images of all views; asked : whether to
-        estimate lenses, a start, curves of the joints, None for those that the data show, and boards.
+        estimate lenses, a start, curves of the joints, None for those that the data show, boards, and known
+        cameras.
     Raises Misfit, naming the joint at fault if one explains it.
     """
-    search, epipolar, (lens, init, curves, boards), curved = start, start.epipolar, asked, None
-    expected, of_boards = expect(epipolar), list[Finding]()
+    search, epipolar, (lens, init, curves, boards, cameras), curved = start, start.epipolar, asked, None
+    expected, of_stated = expect(epipolar), list[Finding]()
     try:
         solution, note = solve(start if len(whole.view) <= 2 or init else fewer(start), expected, init)
         if len(whole.view) > 2:
@@ -299,7 +302,10 @@ def _maximum_likelihood(
         solution = fit_joint_noise(solution, expected, search.joint_noise)
         if boards:
             search.progress("calibration, boards", 0, 1)
-            solution, boards, of_boards = with_known_shapes(solution, boards, expected)
+            solution, boards, of_stated = with_known_shapes(solution, boards, expected)
+        if cameras is not None:
+            solution, of_cameras = with_known_intrinsics(solution, cameras, expected)
+            of_stated += of_cameras
         result = _refined(solution, epipolar, expected, frame, limit_px)
         if boards:
             result = changed(
@@ -332,7 +338,7 @@ def _maximum_likelihood(
             ahead.append(dataclasses.replace(doubted.finding, severity=severity))
     if epipolar.sigma_px < expected.min_px:
         ahead.append(Finding("exact_images", LIMITS, amount=epipolar.sigma_px, unit="px"))
-    result = with_findings(result, filter(None, [_worst_view(result), note, *of_boards]), ahead)
+    result = with_findings(result, filter(None, [_worst_view(result), note, *of_stated]), ahead)
     if curved is not None and result.joint_curve is not None:
         result = changed(result, joint_curve=np.hstack([result.joint_curve[:, :5], curved.gains]))
     return solution, expected, result

@@ -120,8 +120,8 @@ class Solution:
 
     @property
     def chi2(self) -> float:
-        """Sum of squared residuals of the detections used and of the joint offsets, px²."""
-        return float((self.residual[self.used] ** 2).sum() + (self.problem.strain(self.params) ** 2).sum())
+        """Sum of squared residuals of the detections used, and of priors, px²."""
+        return float((self.residual[self.used] ** 2).sum()) + self.problem.prior_squares(self.params)
 
     @property
     def raw(self) -> FloatArray:
@@ -228,12 +228,14 @@ class Solution:
         problem, params = self.problem, self.params
         s, m, offsets = problem.shared, len(params.M), 0 if problem.tau is None else problem.q.size
         gauge, own_place = problem.gauge(params), ~problem.detections.on_board[:, None, None]
+        stated = problem.departure_derivative(params)
         if problem.by_pose:
             J = problem.whitened(params, problem.dense(problem.derivative(params), self.used), self.used)
+            J = np.vstack([J, np.pad(stated, ((0, 0), (0, J.shape[1] - s)))])
             factor = inverse_root(J, np.linalg.norm(J, axis=0), gauge)
             return Errors(factor[:s], own_place * factor[s:].reshape(m, 3, -1), np.zeros((m, 3, 3)))
-        R = np.eye(s + offsets)[s:]
-        squares = R.sum(axis=0)
+        R = np.vstack([np.eye(s + offsets)[s:], np.pad(stated, ((0, 0), (0, offsets)))])
+        squares = (R**2).sum(axis=0)
         follows, own = np.zeros((m, 3, s + offsets)), np.zeros((m, 3, 3))
         for markers, A, B in self._tracks(s + offsets):
             U, size, Vt = np.linalg.svd(B, full_matrices=False)

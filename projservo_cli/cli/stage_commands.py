@@ -57,7 +57,8 @@ _OF_STAGES = (
     click.option(
         "--intrinsics",
         metavar="[NAME=]FILE,...",
-        help="YAML file of each camera by OpenCV or ROS: its lens is taken, its focal lengths are compared.",
+        help="YAML file of each camera by OpenCV or ROS: its lens is taken, and its focal lengths and "
+        "centre are priors.",
     ),
     click.option("--joints", metavar="RRPRRR", help="Type of each joint of the table. Default: all R."),
     option.joint_unit(help="Unit of the table's revolute joints. Default: rad."),

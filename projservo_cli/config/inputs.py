@@ -100,6 +100,8 @@ def calibration_inputs(config: Config, files: Files | None = None) -> Calibratio
         tuple(
             (name, _file(f"camera {name}", file, files)) for name, file in (settings.intrinsics or {}).items()
         ),
+        settings.focal_std_fraction,
+        settings.center_std_fraction,
     )
     inputs: CalibrationInputs | RefitInputs = CalibrationInputs(source, how, settings.joint_noise)
     for i, one in enumerate(settings.refits):

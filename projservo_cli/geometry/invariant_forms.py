@@ -9,6 +9,8 @@ import numpy as np
 from projservo_cli.records import FloatArray
 
 _I, _J = np.triu_indices(3)
+# Rows and columns of the entries of intrinsics: focal length, skew, u of the centre, focal length, v.
+UPPER = (0, 0, 0, 1, 1), (0, 1, 2, 1, 2)
 # Orthonormal symmetric forms.
 _BASIS = np.zeros((6, 3, 3))
 _BASIS[range(6), _I, _J] = _BASIS[range(6), _J, _I] = np.where(_I == _J, 1.0, np.sqrt(0.5))
@@ -46,3 +48,24 @@ def board_steps(positions: FloatArray, points: FloatArray) -> FloatArray:
     """Steps (…, 2, 3) from a corner to the next, of corners at positions (k, 2) and points (…, k, 3)."""
     rows = np.column_stack([positions, np.ones(len(positions))])
     return np.asarray(np.linalg.pinv(rows)[:2] @ points)
+
+
+def intrinsics_of(P: FloatArray) -> FloatArray:
+    """Intrinsic matrices (…, 3, 3), px, of cameras (…, 3, 4) of a metric frame, from K Kᵀ."""
+    rows = P[..., ::-1, :3]
+    K = np.linalg.cholesky(rows @ rows.swapaxes(-1, -2))[..., ::-1, ::-1]
+    return np.asarray(K / K[..., 2:, 2:])
+
+
+def intrinsics_derivative(P: FloatArray) -> FloatArray:
+    """Derivatives (…, 5, 12) of the upper entries of intrinsics (``UPPER``) by cameras (…, 3, 4).
+
+    K⁻¹ dA A⁻¹ K of A = s K R is K⁻¹ dK, which is upper triangular, plus a rotation's rate and ds / s.
+    """
+    K, by_entry = intrinsics_of(P), np.zeros((12, 3, 4))
+    by_entry.reshape(12, 12)[:] = np.eye(12)
+    right = np.linalg.solve(P[..., :3], K)
+    X = np.linalg.solve(K[..., None, :, :], by_entry[..., :3] @ right[..., None, :, :])
+    size = np.diagonal(X, axis1=-2, axis2=-1) - X[..., 2:, 2]
+    U = np.triu(X + X.swapaxes(-1, -2), 1) + size[..., None] * np.eye(3)
+    return np.asarray((K[..., None, :, :] @ U)[..., *UPPER].swapaxes(-1, -2))

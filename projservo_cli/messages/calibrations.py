@@ -91,7 +91,8 @@ CALIBRATION = {
         "lens distortion would explain {percent} % of the squared residuals", "try --lens", limit="lens"
     ),
     "other_intrinsics": Row(
-        "the focal length of the {view} camera is {amount} by the images, and {limit} by its file",
+        "the {name} of the {view} camera is {amount} by the images, and {limit} by its file, which is not "
+        "used as a prior",
         "look whether the file is of this camera, and of this zoom, focus and size of images",
         limit="the {view} camera, which is not as its file",
     ),

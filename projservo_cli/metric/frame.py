@@ -43,6 +43,7 @@ from projservo_cli.geometry.invariant_forms import (
     differences_of_lengths,
     distortions_of_boards,
     form_of,
+    intrinsics_of,
 )
 from projservo_cli.geometry.joint_curve import true_joints
 from projservo_cli.geometry.lens import TERMS, undistort
@@ -106,9 +107,7 @@ class MetricParameters(NamedTuple):
 
     def intrinsics(self) -> FloatArray:
         """Intrinsic matrices (…, V, 3, 3), px, from K Kᵀ of the cameras."""
-        rows = self.P[..., ::-1, :3]
-        K = np.linalg.cholesky(rows @ rows.swapaxes(-1, -2))[..., ::-1, ::-1]
-        return np.asarray(K / K[..., 2:, 2:])
+        return intrinsics_of(self.P)
 
     def camera_poses(self) -> FloatArray:
         """Poses (…, V, 4, 4) of the cameras in the frame they are mounted in, m."""

@@ -80,7 +80,13 @@ class CalibrationSettings(Section):
     intrinsics: dict[str, Text] | None = Field(
         None,
         description="YAML file of each camera by its name, as OpenCV or ROS writes it: its lens is taken, "
-        "and its focal lengths are compared with the images",
+        "and its intrinsics are priors of the fit unless the images contradict them",
+    )
+    focal_std_fraction: Positive = Field(
+        0.005, description="standard deviation of focal lengths, and of the skew, of intrinsics, over these"
+    )
+    center_std_fraction: Positive = Field(
+        0.01, description="standard deviation of the centres of intrinsics, over the size of the image"
     )
     joint_model: Literal["auto"] | tuple[str, ...] | None = Field(
         None,

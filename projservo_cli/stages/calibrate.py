@@ -1,29 +1,25 @@
 """Stage calibrate: trial motions or a recorded table in, projective kinematics out."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
-from scipy.special import chdtri
 
 from projservo_cli.calibration.checks.board_corner_numbering import BoardNumbering
 from projservo_cli.calibration.checks.joint_order import undecided_pairs
 from projservo_cli.calibration.checks.screening import screened
 from projservo_cli.calibration.checks.validation import cross_validate
 from projservo_cli.calibration.initial.initialization import Nominal
+from projservo_cli.calibration.known_intrinsics import KnownCameras
 from projservo_cli.calibration.pipeline import calibrate
-from projservo_cli.calibration.prediction import error_factor_with_model
 from projservo_cli.calibration.refit import refit, since_moved
 from projservo_cli.calibration.robust_fit import Solution
-from projservo_cli.findings import LIMITS, Finding, Subject
 from projservo_cli.geometry.flange import FlangeChart
 from projservo_cli.geometry.lens import K1
 from projservo_cli.image_size import image_sizes
 from projservo_cli.messages import lines, with_findings
 from projservo_cli.messages.rows_by_code import Setup
-from projservo_cli.metric.frame import Metric
 from projservo_cli.observations import KnownNoise, Observations
 from projservo_cli.planning.pose_selection import FARTHER, Suggestion, region_around, suggest
 from projservo_cli.records import (
@@ -52,15 +48,12 @@ from projservo_cli.stages.stage_inputs import (
     Trials,
     of_simulation,
 )
-from projservo_cli.store.camera_files import Intrinsics, read_intrinsics
+from projservo_cli.store.camera_files import read_intrinsics
 from projservo_cli.store.files_and_locks import write_whole
 from projservo_cli.store.flange_poses import pose_columns
 from projservo_cli.store.nominal_robot import read_nominal
 from projservo_cli.store.observation_tables import mount_in, read_detections, read_table, to_csv
 
-# Deviations of stated intrinsics, as shares of the focal length and of the size of the image for its middle,
-# and the probability that chance contradicts them as much.
-_FOCAL, _MIDDLE, _BY_CHANCE = 0.005, 0.01, 1e-4
 _Calibrated = tuple[Observation, Calibration, CrossValidation | None]
 
 
@@ -176,7 +169,7 @@ def estimate(
             mount=seen.mount,
             joint_model=asked.joint_model,
             boards=asked.boards,
-            lenses=None if not cameras else np.array([camera.lens for camera in cameras]),
+            cameras=cameras,
             fitted=judge,
             progress=progress,
         )
@@ -203,14 +196,13 @@ def estimate(
         turned_images=board.images,
     )
     found = [*calibration.open_order, *screening.findings, *board.findings]
-    found += _other_intrinsics(calibration, cameras)
     return board.observation, with_findings(calibration, found), next(iter(held_out), None)
 
 
-def _cameras(seen: Observations, asked: Estimation) -> list[Intrinsics]:
-    """Known cameras of all views; none without. Raises InputError for names or sizes that do not fit."""
+def _cameras(seen: Observations, asked: Estimation) -> KnownCameras | None:
+    """Known cameras of all views; None without. Raises InputError for names or sizes that do not fit."""
     if not asked.intrinsics:
-        return []
+        return None
     files = {name: file.path for name, file in asked.intrinsics}
     if {*files} == {ONLY} and len(seen.view) == 1:
         files = {seen.view[0]: files[ONLY]}
@@ -227,33 +219,11 @@ def _cameras(seen: Observations, asked: Estimation) -> list[Intrinsics]:
             raise InputError(
                 f"{files[name]}: is of images of {stated} px, and those of {name} are {given} px"
             )
-    return cameras
-
-
-def _other_intrinsics(calibration: Calibration, cameras: Sequence[Intrinsics]) -> list[Finding]:
-    """Findings on cameras whose intrinsics by the images are not as stated, within the deviations of both."""
-    if not cameras:
-        return []
-    try:
-        factor = error_factor_with_model(calibration)
-        scale = calibration.marker[[0, -1]].tolist()
-        known = calibration.flange_chart is not None or calibration.prismatic.any()
-        metric = (
-            Metric.of(calibration, factor)
-            if known
-            else Metric.of(calibration, factor, length_m=1.0, between=scale)
-        )
-    except (InputError, WorkFailed):
-        return []  # joints and markers show no intrinsics
-    found = []
-    for view, camera, K, C in zip(calibration.view, cameras, metric.K, metric.covariance("K"), strict=True):
-        u, v = (0, 1, 0, 1), (0, 1, 2, 2)
-        off, S = (K - camera.K)[u, v], C[np.ix_((0, 3, 2, 4), (0, 3, 2, 4))]
-        stated = np.array([_FOCAL * K[0, 0], _FOCAL * K[1, 1], *(_MIDDLE * 2.0 * camera.K[:2, 2])])
-        if off @ np.linalg.solve(S + np.diag(stated**2), off) > chdtri(4, _BY_CHANCE):
-            about = Subject(views=(view,)), float(K[0, 0]), float(np.sqrt(S[0, 0])), float(camera.K[0, 0])
-            found.append(Finding("other_intrinsics", LIMITS, *about, "px"))
-    return found
+    K = np.array([camera.K for camera in cameras])
+    of_centers = [camera.size or 2.0 * camera.K[:2, 2] for camera in cameras]
+    u, v = asked.center_std_fraction * np.array(of_centers, dtype=np.float64).T
+    x, y = asked.focal_std_fraction * K[:, (0, 1), (0, 1)].T
+    return KnownCameras(K, np.array([one.lens for one in cameras]), np.stack([x, x, u, y, v], axis=1))
 
 
 def suggest_motions(

@@ -205,6 +205,8 @@ class Estimation:
     joint_model: str | tuple[str, ...] | None = None  # auto, or curves of joints to fit
     boards: tuple[StatedBoard, ...] = ()  # boards whose corners are markers, of known shape
     intrinsics: tuple[tuple[str, File], ...] = ()  # file of each camera that is known, by its name
+    focal_std_fraction: float = 0.005  # standard deviation of their focal lengths, over these
+    center_std_fraction: float = 0.01  # the same of their centres, over the size of the image
 
 
 @dataclass(frozen=True, eq=False)

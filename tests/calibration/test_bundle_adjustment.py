@@ -9,10 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from projservo_cli.calibration import bundle_adjustment
-from projservo_cli.calibration.bundle_adjustment import LeastSquares, minimize
+from projservo_cli.calibration.bundle_adjustment import LeastSquares, StatedIntrinsics, minimize
 from projservo_cli.calibration.detections import Detections
 from projservo_cli.calibration.prediction import Parameters
 from projservo_cli.geometry.displacements import displacements
+from projservo_cli.geometry.invariant_forms import UPPER, intrinsics_of
 from projservo_cli.geometry.kinematics import forward_kinematics, image_jacobian, joint_operators
 from projservo_cli.records import Model, no_lenses, prismatic_of
 from tests.calibration.simulated_robot import Robot, around, random_robot
@@ -74,14 +75,45 @@ def test_gauge_directions_change_no_image():
         assert singular[-dimension] < 1e-13 < 1e-6 < singular[-dimension - 1]
 
 
+def stated(scene, rng):
+    """Intrinsics of a scene, changed by their deviations, but for one that is not known."""
+    spread = rng.uniform(1.0, 3.0, (len(scene.P), 5))
+    spread[0, 1] = np.inf
+    K = intrinsics_of(scene.P)
+    K[:, *UPPER] += np.where(np.isfinite(spread), spread, 0.0) * rng.standard_normal(spread.shape)
+    return StatedIntrinsics(K, spread)
+
+
+def test_derivatives_of_intrinsics_agree_with_central_differences():
+    """To the truncation and round-off of the quotient; they move with no gauge."""
+    problem, scene = problem_of(random_robot("RRR", np.random.default_rng(4)))
+    problem = dataclasses.replace(problem, stated=stated(scene, np.random.default_rng(0)))
+    D, numeric = problem.departure_derivative(scene), []
+    for k in range(scene.P.size):
+        step = np.zeros(problem.size)
+        step[k] = 1e-6 * max(np.abs(scene.P.ravel()[k]), 1e-3)
+        ahead, behind = (problem.departure(problem.retract(scene, s)).ravel() for s in (step, -step))
+        numeric.append((ahead - behind) / (2.0 * step[k]))
+    scale = np.linalg.norm(D, axis=0)[: scene.P.size]
+    assert np.abs(np.transpose(numeric) - D[:, : scene.P.size]).max(axis=0) == pytest.approx(
+        0.0, abs=1e-6 * scale.max()
+    )
+    assert np.abs(D @ problem.gauge(scene)[: problem.shared]).max() < 1e-9 * np.abs(D).max()
+    assert problem.free == problem.size - 9
+
+
+@pytest.mark.parametrize("known", [False, True])
 @pytest.mark.parametrize(("joint_noise", "poses"), [(False, 9), (True, 4), (True, 30)])
-def test_steps_of_blocks_are_those_of_the_dense_equations(joint_noise, poses, monkeypatch):
+def test_steps_of_blocks_are_those_of_the_dense_equations(joint_noise, poses, known, monkeypatch):
     """Markers eliminated, with offsets of joints or without; offsets eliminated; in one part and in many."""
     problem, scene = problem_of(random_robot("RPR", np.random.default_rng(6)), unseen=0.3, count=poses)
     rng = np.random.default_rng(0)
     if joint_noise:
         problem = problem.with_noise(np.array([2e-3, 1e-3, 2e-3]))
         scene = dataclasses.replace(scene, offsets=1e-3 * rng.standard_normal(problem.q.shape))
+    if known:
+        problem = dataclasses.replace(problem, stated=stated(scene, rng))
+    departure, D = problem.departure(scene).ravel(), problem.departure_derivative(scene)
     weight = rng.uniform(0.1, 1.0, problem.detections.seen.shape)
     residual = problem.residual(scene) + rng.standard_normal((*weight.shape, 2))
     strain, damping = problem.strain(scene), 1e-2
@@ -97,6 +129,8 @@ def test_steps_of_blocks_are_those_of_the_dense_equations(joint_noise, poses, mo
     g = J.T @ (root[:, 0] ** 2 * residual.ravel())
     A[problem.size :, problem.size :] += np.eye(strain.size)
     g[problem.size :] += strain.ravel()
+    A[: problem.shared, : problem.shared] += D.T @ D
+    g[: problem.shared] += D.T @ departure
     scale = np.append(np.sqrt(np.diagonal(A)[: problem.size]), np.ones(strain.size))
     tied = np.linalg.qr(scale[: problem.size, None] * problem.gauge(scene))[0]
     A /= np.outer(scale, scale)
@@ -107,7 +141,7 @@ def test_steps_of_blocks_are_those_of_the_dense_equations(joint_noise, poses, mo
         monkeypatch.setattr(bundle_adjustment, "_MAX_KEPT", kept)
         here = bundle_adjustment._Expansion(problem, scene, residual, weight, np.zeros(problem.size))
         assert here.by_pose == (joint_noise and poses == 30)
-        found = here._whole(here.solved(damping)(residual, strain))
+        found = here._whole(here.solved(damping)(residual, strain, departure))
         assert np.abs((found - wanted) * scale).max() < 1e-9 * np.abs(wanted * scale).max()
         assert np.allclose(here.change(wanted).ravel(), J @ wanted, rtol=1e-9, atol=1e-9)
 

@@ -4,11 +4,17 @@ import numpy as np
 import pytest
 import yaml
 
-from projservo_cli.records import WORLD, InputError
+from projservo_cli.calibration.known_intrinsics import KnownCameras
+from projservo_cli.calibration.pipeline import calibrate
+from projservo_cli.geometry.flange import FLANGE_TYPES, FlangeChart
+from projservo_cli.geometry.invariant_forms import UPPER
+from projservo_cli.records import WORLD, InputError, Observation
+from projservo_cli.results import ImageModel
 from projservo_cli.store.camera_files import read_intrinsics
 from projservo_cli.store.flange_poses import pose_columns
 from projservo_cli.store.observation_tables import to_csv
-from tests.calibration import flange
+from tests.calibration import board_arms, flange
+from tests.calibration.simulated_robot import around, random_robot
 
 cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed: pip install '.[detect]'")
 
@@ -83,7 +89,89 @@ def test_a_known_lens_is_taken_and_another_camera_is_named(projservo, monkeypatc
     assert told["rms_px"] < 1.1 * np.sqrt(2) * 0.3
     found = projservo("calibrate", *train, "--intrinsics", "eye=other.yaml", "-o", "other", "--json")
     said = [one for one in found.json["findings"] if one["code"] == "other_intrinsics"]
-    assert [one["subject"]["views"] for one in said] == [["eye"]]
+    assert [(one["subject"]["views"], one["subject"]["name"]) for one in said] == [(["eye"], "focal length")]
+
+
+# Deviations of the entries of K: 0.5 % of the focal length, and of the skew, 1 % of the image for the centre.
+DEVIATION = np.array([0.005 * 905.0, 0.005 * 905.0, 12.8, 0.005 * 903.0, 9.6])
+IDEAL = np.array([640.0, 480.0, 640.0, 0.0, 0.0])
+
+
+def by_flange(views=1, known=None, count=8):
+    """A calibration by few poses of the flange, and of known cameras, K (V, 3, 3)."""
+    rng = np.random.default_rng(3)
+    T = flange.poses(rng, count)
+    chart, seen = FlangeChart.of(T), flange.images(T, WORLD, rng, 0.3, views=views)
+    where = {"view": ("one", "two")[:views], "flange_chart": chart.record}
+    seen = Observation(np.arange(count), np.arange(48), chart.coordinates(T), seen, **where)
+    return calibrate(seen, FLANGE_TYPES, joint_noise=0.0, source="recorded", cameras=cameras(known))
+
+
+def by_joints(known=None):
+    """A calibration by six revolute joints, whose invariant form is the metric of two cameras."""
+    robot = random_robot("RRRRRR", np.random.default_rng(2), markers=4)
+    rng = np.random.default_rng(5)
+    seen = robot.observe(around(robot, 14, rng), 0.5, rng)
+    return calibrate(seen, "RRRRRR", sigma_px=0.5, cameras=cameras(known))
+
+
+def by_parallel_axes(known=None):
+    """A calibration by parallel axes and a board of known shape."""
+    types, seen = board_arms.recording("scara", np.random.default_rng(4), sigma_px=0.3)
+    return calibrate(seen, types, boards=(board_arms.BOARD,), source="recorded", cameras=cameras(known))
+
+
+def cameras(K):
+    """Known cameras without distortion."""
+    return (
+        None if K is None else KnownCameras(K, np.tile(IDEAL, (len(K), 1)), np.tile(DEVIATION, (len(K), 1)))
+    )
+
+
+def metric_of(found, fit):
+    """Entries (V, 5) of K, and their covariance (5 V, 5 V)."""
+    length = {} if fit is not by_joints else {"length_m": 1.0, "between": found.marker[[0, 1]].tolist()}
+    metric = ImageModel.of(found).metric(**length)
+    changes = metric.deviations("K").reshape(-1, 5 * len(metric.K))
+    return metric.K[:, *UPPER], changes.T @ changes
+
+
+@pytest.mark.parametrize("fit", [by_flange, by_joints, by_parallel_axes])
+def test_few_poses_and_stated_intrinsics_give_what_both_know_together(fit):
+    """K and its covariance are those of the normal densities of both, to the second order of the camera.
+
+    The prior lies one deviation of both off, so that it moves K; what is left is a tenth of a deviation.
+    """
+    free = fit()
+    K, C = metric_of(free, fit)
+    S = np.diag(np.tile(DEVIATION**2, len(K)))
+    both = np.linalg.inv(np.linalg.inv(C) + np.linalg.inv(S))
+    shift = np.linalg.cholesky(C + S) @ np.tile([0.6, -0.6, 0.6, 0.3, -0.6], len(K))
+    stated = np.tile(np.eye(3), (len(K), 1, 1))
+    stated[:, *UPPER] = K + shift.reshape(K.shape)
+    held = fit(known=stated)
+    assert "other_intrinsics" not in {one.code for one in held.findings}
+    found, of_both = metric_of(held, fit)
+    size = np.sqrt(np.diag(both))
+    assert size.reshape(K.shape)[:, 0].max() < 0.9 * np.sqrt(np.diag(C)).reshape(K.shape)[:, 0].max()
+    np.testing.assert_allclose(np.sqrt(np.diag(of_both)), size, rtol=0.15)
+    wanted = K.ravel() + C @ np.linalg.solve(C + S, shift)
+    assert np.abs((found.ravel() - wanted) / size).max() < 0.3
+
+
+def test_a_camera_of_another_focal_length_is_named_and_leaves_the_other_as_a_prior():
+    """Of 5 %, as another mode of the sensor; without any prior left the fit is the one without files."""
+    free, right = by_flange(2), np.tile(flange.K, (2, 1, 1))
+    wrong = right.copy()
+    wrong[1, (0, 1), (0, 1)] *= 1.05
+    held = by_flange(2, wrong)
+    said = [one for one in held.findings if one.code == "other_intrinsics"]
+    assert [(one.subject.views, one.subject.name) for one in said] == [(("two",), "focal length")]
+    assert said[0].amount == pytest.approx(said[0].limit / 1.05, abs=4.0 * said[0].deviation)
+    K, C = (metric_of(free, by_flange), metric_of(held, by_flange))
+    assert np.sqrt(C[1][0, 0]) < 0.9 * np.sqrt(K[1][0, 0])
+    alone = by_flange(1, wrong[1:])
+    np.testing.assert_array_equal(alone.P, by_flange(1).P)
 
 
 @pytest.mark.parametrize(
