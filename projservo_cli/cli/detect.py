@@ -129,8 +129,8 @@ def _detect(
     right. Readings are copied as they are: say --joint-unit deg on calibrate if they are degrees.
 
     A bag of ROS 1 or 2 (--bag) brings images and readings along. The poses are the stops of the robot, each
-    with one image of each camera; images in motion are kept for the delay of the cameras. Needs rosbags: pip
-    install '.[bags]'.
+    with one image of each camera; images in motion are kept for the delay of the cameras. The CameraInfo
+    next to images becomes TABLE_NAME.yaml, for calibrate --intrinsics. Needs rosbags: pip install '.[bags]'.
 
     With --lerobot images and joints are those of episodes, at frames at which the arm hardly moves; joints
     are then in rad, and grippers are left out. Cameras are all of the data set, or NAME=KEY each. If a camera
@@ -175,7 +175,9 @@ def _detect(
         if readings is not None or readings_topic is None:
             raise click.UsageError("--bag: name the readings by --readings-topic, not by --readings")
         chosen = tuple(name for name in joint_names.split(",") if name)
-        series, extra = _of_bag(console, bag, (*topics, *images), readings_topic, frames, chosen)
+        series, extra = _of_bag(
+            console, bag, (*topics, *images), readings_topic, frames, chosen, (output, force)
+        )
     observation, found = observe_tags(series, finder, points, console.progress)
     write_table(observation, output)
     rest, names = observation.at_rest, series.view
@@ -236,9 +238,15 @@ def _of_bag(
     readings: str,
     frames: tuple[str, str] | None,
     joint_names: tuple[str, ...],
+    near: tuple[Path, bool],
 ) -> tuple["ImageSeries", dict[str, Any]]:
-    """Images and readings of a bag, which stays open until the command ends, and what else to report."""
+    """Images and readings of a bag, which stays open until the command ends, and what else to report.
+
+    near : table next to which files of cameras are written, and whether to replace them.
+    """
     from projservo_cli.detection.bags import bag_series, open_bag
+    from projservo_cli.store.camera_files import camera_info
+    from projservo_cli.store.files_and_locks import write_whole
 
     if not topics:
         raise click.UsageError("--bag: name the topics of the images, --images NAME=TOPIC ...")
@@ -248,12 +256,20 @@ def _of_bag(
         f"{name}: {sum(fate.values())} images: " + ", ".join(f"{fate[word]} {word}" for word in sorted(fate))
         for name, fate in found.fate.items()
     ]
-    for note in [*found.notes, *counts]:
+    files = {name: near[0].with_name(f"{near[0].stem}_{name}.yaml") for name in found.cameras}
+    for path in files.values():
+        option.require_new(path, force=near[1])
+    for name, path in files.items():
+        K, coefficients, model, size = found.cameras[name]
+        write_whole(path, camera_info(name, K, coefficients, size, model))
+    known = [f"CameraInfo of {name}: {path}, for calibrate --intrinsics" for name, path in files.items()]
+    for note in [*found.notes, *counts, *known]:
         console.say(f"detect: {note}")
     moving = found.series.moving
     return found.series, {
         "poses_in_motion": 0 if moving is None else int((moving > 0).sum()),
         "images": found.fate,
+        "intrinsics": {name: path.resolve() for name, path in files.items()},
     }
 
 

@@ -21,6 +21,8 @@ from projservo_cli.detection.stops import STOP_S, shots
 from projservo_cli.records import FloatArray, InputError, JointList
 
 _IMAGE, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+# Topic of CameraInfo next to one of images, without the name of how they are packed.
+_INFO, _PACKED = "camera_info", "/compressed"
 _STATIC = "_static"  # ends the topic of transforms that do not change
 # Messages from one report of progress to the next.
 _OFTEN = 50
@@ -199,12 +201,59 @@ def _pixels(message: Any, where: str) -> tuple[Any, str]:
     return values.reshape((height, width, channels) if channels > 1 else (height, width)), conversion
 
 
+class BagCamera(NamedTuple):
+    """A camera as a message CameraInfo states it."""
+
+    K: FloatArray  # (3, 3) px
+    coefficients: FloatArray  # of its lens
+    model: str  # of its lens
+    size: tuple[int, int]  # width and height, px
+
+
+def _cameras(
+    infos: Mapping[str, tuple[str, set[tuple[Any, ...]]]], images: Sequence[BagImage], notes: list[str]
+) -> dict[str, BagCamera]:
+    """Cameras by name, with notes on those of which nothing is taken.
+
+    infos : topic of CameraInfo and distinct contents, by the names of cameras; images : one of each.
+    """
+    found = {}
+    for (name, (topic, contents)), image in zip(infos.items(), images, strict=True):
+        if not contents:  # as most bags have none
+            continue
+        (width, height, model, D, K, P), (rows, columns) = next(iter(contents)), image.grey().shape
+        straight = "image_rect" in image.place.topic  # such images have neither K nor lens of the camera
+        matrix = np.reshape(P, (3, 4))[:, :3] if straight else np.reshape(K, (3, 3))
+        if sum(topic == other for other, _ in infos.values()) > 1:
+            why = "is next to images of several cameras"
+        elif len(contents) > 1:
+            why = f"has {len(contents)} contents, as of a camera with zoom or autofocus"
+        elif not (matrix[0, 0] > 0.0 and matrix[1, 1] > 0.0):
+            why = "has a focal length of 0, as of a camera that is not calibrated"
+        elif (width, height) != (columns, rows):
+            why = f"is of {width}x{height} px, and the images are {columns}x{rows}, binned or cropped"
+        else:
+            found[name] = BagCamera(matrix, np.zeros(5) if straight else np.array(D), model, (width, height))
+            continue
+        notes.append(f"{image.bag.path}: {topic} {why}: nothing of it is taken")
+    return found
+
+
+def _content(info: Any) -> tuple[Any, ...]:
+    """Size, model, coefficients, K and P of a CameraInfo, whose matrices ROS 1 writes in capitals."""
+    matrices = (getattr(info, name, None) for name in "DKP")
+    D, K, P = (getattr(info, n) if M is None else M for n, M in zip("dkp", matrices, strict=True))
+    numbers = (tuple(map(float, M)) for M in (D, K, P))
+    return int(info.width), int(info.height), str(info.distortion_model), *numbers
+
+
 class BagSeries(NamedTuple):
     """Images and readings of a bag, and notes on them."""
 
     series: ImageSeries
     fate: dict[str, dict[str, int]]  # of each camera, how many images became what
     notes: list[str]
+    cameras: dict[str, BagCamera]  # as CameraInfo states them
 
 
 def bag_series(
@@ -236,8 +285,15 @@ def bag_series(
     unstamped, peak = Counter[str](), Counter[str]()
     taken = {topic: list[tuple[int, _Place]]() for topic in topics.values()}
     readings = Readings(where, notes)
-    for place, message in bag.messages([source, source + _STATIC, *taken], progress):
-        if hasattr(message, "transforms"):
+    beside = {
+        name: f"{topic.removesuffix(_PACKED).rpartition('/')[0]}/{_INFO}" for name, topic in topics.items()
+    }
+    contents = {topic: set[tuple[Any, ...]]() for topic in beside.values()}
+    infos = {name: (topic, contents[topic]) for name, topic in beside.items()}
+    for place, message in bag.messages([source, source + _STATIC, *taken, *contents], progress):
+        if place.topic in contents:
+            contents[place.topic].add(_content(message))
+        elif hasattr(message, "transforms"):
             for part in message.transforms:
                 constant = place.topic != source
                 stamp = 0 if constant else _stamp(part.header, place, unstamped)
@@ -284,7 +340,8 @@ def bag_series(
     series = ImageSeries(tuple(topics), joints, rows)
     if found.moving.any():
         series = series._replace(moving=found.moving, t_q=found.t_q, t_view=t_view)
-    return BagSeries(series, dict(zip(topics, map(dict, found.fate), strict=True)), notes)
+    cameras = _cameras(infos, [row[0][1] for row in images], notes)
+    return BagSeries(series, dict(zip(topics, map(dict, found.fate), strict=True)), notes, cameras)
 
 
 def _stamp(header: Any, place: _Place, unstamped: Counter[str]) -> int:

@@ -47,6 +47,11 @@ def read_intrinsics(path: Path | str) -> Intrinsics:
     if given not in _MODELS:
         raise InputError(f"{path}: distortion_model {given}: choose among {', '.join(_MODELS)}")
     coefficients = _matrix(path, values, ("distortion_coefficients", "distCoeffs", "D", "d"), None).ravel()
+    if coefficients[8:].any():
+        raise InputError(
+            f"{path}: its lens has coefficients of a thin prism or a tilted sensor, of which none is here: "
+            "leave the file out, and calibrate with --lens, or undistort the images"
+        )
     width, height = (values.get(name) for name in ("image_width", "image_height"))
     size = (int(width), int(height)) if width and height else None
     extent = np.array(size or (2.0 * K[0, 2], 2.0 * K[1, 2]))
@@ -57,6 +62,23 @@ def read_intrinsics(path: Path | str) -> Intrinsics:
             "most: leave it out, and calibrate with --lens, or undistort the images"
         )
     return Intrinsics(K, lens, size, off)
+
+
+def camera_info(
+    name: str, K: FloatArray, coefficients: FloatArray, size: tuple[int, int], model: str = "plumb_bob"
+) -> str:
+    """File of a camera for ROS's camera_info_manager, as its calibration writes it."""
+    rows = {
+        "camera_matrix": K,
+        "distortion_coefficients": coefficients[None],
+        "rectification_matrix": np.eye(3),
+        "projection_matrix": np.column_stack([K, np.zeros(3)]),
+    }
+    values = {
+        key: {"rows": len(M), "cols": M.shape[1], "data": M.ravel().tolist()} for key, M in rows.items()
+    }
+    about = {"image_width": size[0], "image_height": size[1], "camera_name": name, "distortion_model": model}
+    return yaml.safe_dump(about | values, sort_keys=False, default_flow_style=None)
 
 
 def _document(path: Path | str) -> dict[str, Any]:

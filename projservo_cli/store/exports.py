@@ -6,7 +6,6 @@ from typing import Any
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
-import yaml
 from scipy.spatial.transform import Rotation
 
 from projservo_cli.geometry.displacements import rigid_inverse
@@ -14,6 +13,7 @@ from projservo_cli.image_size import ImageSize, image_sizes
 from projservo_cli.metric.frame import Metric
 from projservo_cli.metric.opencv import OpenCV
 from projservo_cli.records import TOOL, VIEWS, FloatArray, InputError
+from projservo_cli.store.camera_files import camera_info
 
 # Limits of a URDF joint that no calibration knows: N m or N, and rad/s or m/s.
 _EFFORT, _SPEED = 100.0, 1.0
@@ -60,19 +60,8 @@ def camera_infos(found: OpenCV, size: ImageSize | None, names: Sequence[str]) ->
     K, files = found.body.intrinsics(), {}
     K[:, 0, 1] = 0.0  # rounding errors
     for v, (name, (width, height)) in enumerate(zip(names, image_sizes(size, names), strict=True)):
-        rows = {
-            "camera_matrix": K[v],
-            "distortion_coefficients": found.distortion[v : v + 1],
-            "rectification_matrix": np.eye(3),
-            "projection_matrix": np.column_stack([K[v], np.zeros(3)]),
-        }
-        values = {
-            key: {"rows": len(M), "cols": M.shape[1], "data": M.ravel().tolist()} for key, M in rows.items()
-        }
-        about = {"image_width": int(width), "image_height": int(height), "camera_name": name}
-        files[f"{name}_info.yaml"] = yaml.safe_dump(
-            about | {"distortion_model": "plumb_bob"} | values, sort_keys=False, default_flow_style=None
-        )
+        size_of = int(width), int(height)
+        files[f"{name}_info.yaml"] = camera_info(name, K[v], found.distortion[v], size_of)
     return files
 
 

@@ -178,6 +178,8 @@ def test_a_camera_of_another_focal_length_is_named_and_leaves_the_other_as_a_pri
     ("model", "coefficients", "message"),
     [
         ("thin_prism", np.zeros(5), "distortion_model thin_prism"),
+        ("rational_polynomial", np.r_[BENT, 0.0, 0.0, 0.0, 0.01, 0.0, 0.0, 0.0], "of a thin prism"),
+        ("rational_polynomial", np.array([0.8, 0.2, 0.0, 0.0, 0.01, 1.4, 0.3, 0.02]), "miss its lens"),
         ("plumb_bob", np.array([-0.2, 0.05, 0.01, 0.01, 0.0]), "miss its lens"),
         ("plumb_bob", np.array([-0.35, 0.15, 0.0, 0.0, -0.03]), "miss its lens"),  # at the borders alone
         ("fisheye", np.array([-0.01, 0.003, -0.002, 0.0004]), "miss its lens"),

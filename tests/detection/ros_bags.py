@@ -139,6 +139,18 @@ class Bag:
         )  # fmt: skip
         self.put(topic, t + 0.004, message)
 
+    def camera_info(self, topic, t, size, K, D, model="plumb_bob", P=None):
+        """A CameraInfo, whose matrices have capitals in ROS 1."""
+        P = np.column_stack([K, np.zeros(3)]) if P is None else P
+        matrices = {"D": np.array(D), "K": np.ravel(K), "R": np.eye(3).ravel(), "P": np.ravel(P)}
+        cases = {name if self.one else name.lower(): values for name, values in matrices.items()}
+        roi = self.type("sensor_msgs/msg/RegionOfInterest")(0, 0, 0, 0, False)
+        message = self.type("sensor_msgs/msg/CameraInfo")(
+            header=self.header(t), width=size[0], height=size[1], distortion_model=model, **cases,
+            binning_x=0, binning_y=0, roi=roi,
+        )  # fmt: skip
+        self.put(topic, t + 0.002, message)
+
     def compressed(self, topic, t, content, form="jpeg"):
         message = self.type("sensor_msgs/msg/CompressedImage")(
             header=self.header(t), format=form, data=np.frombuffer(content, np.uint8)

@@ -13,6 +13,7 @@ from projservo_cli.detection.bags import bag_series, open_bag
 from projservo_cli.detection.stops import Stream
 from projservo_cli.geometry.flange import FlangeChart
 from projservo_cli.records import InputError
+from projservo_cli.store.camera_files import camera_info, read_intrinsics
 from projservo_cli.store.flange_poses import pose_columns
 from projservo_cli.store.observation_tables import read_table, to_csv
 from tests.calibration.simulated_robot import around
@@ -22,6 +23,7 @@ from tests.detection.ros_bags import (
     MOVE_S,
     NAMES,
     OPTIONS,
+    SIZE,
     STOP_S,
     Bag,
     Show,
@@ -273,6 +275,85 @@ def test_grey_values_of_twelve_bits_are_scaled_by_their_range():
         found = bag_series(bag, {"left": "/left"}, "/joint_states", None, (), lambda *_: None)
         np.testing.assert_allclose(found.series.images[0][0].grey(), pixels / 4095 * 255, atol=1e-12)
     assert any("/left: 12 of 16 bit are used" in note for note in found.notes)
+
+
+K8 = np.array([[10.0, 0.0, 4.1], [0.0, 11.0, 3.9], [0.0, 0.0, 1.0]])
+SMALLER = np.c_[0.9 * K8[:, :2], K8[:, 2], np.zeros(3)]
+LENS = [-0.01, 0.001, 0.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("storage", "topic", "model", "lens"),
+    [
+        ("ros1", "/cam/image_raw", "plumb_bob", LENS),
+        ("sqlite3", "/cam/image_raw/compressed", "rational_polynomial", [*LENS, 0.0, 0.0, 0.0]),
+        ("mcap", "/cam/image_rect", "plumb_bob", LENS),
+    ],
+)
+def test_camera_info_next_to_images_becomes_a_file_of_a_camera(projservo, storage, topic, model, lens):
+    """K of raw images and their lens; of rectified ones K of the projection, and no lens."""
+    path = "b.bag" if storage == "ros1" else "b"
+    show, bag = simple(path, storage, stops=4)
+    for t in np.arange(0.1, show.end, 0.1):
+        bag.camera_info("/cam/camera_info", t, (8, 8), K8, lens, model, SMALLER)
+        if "compressed" in topic:
+            bag.compressed(topic, t, cv2.imencode(".png", np.zeros((8, 8), dtype=np.uint8))[1].tobytes())
+        else:
+            bag.image(topic, t, np.zeros((8, 8), dtype=np.uint8))
+    bag.close()
+    found = series(path, eye=topic).cameras["eye"]
+    rectified = topic.endswith("rect")
+    np.testing.assert_array_equal(found.K, SMALLER[:, :3] if rectified else K8)
+    assert (found.size, found.model) == ((8, 8), model)
+    Path("eye.yaml").write_text(camera_info("eye", *found[:2], found.size, found.model))
+    read = read_intrinsics("eye.yaml")
+    np.testing.assert_array_equal(read.K, found.K)
+    assert (read.size, read.lens[3:].any()) == ((8, 8), not rectified)
+
+
+NOT_TAKEN = {
+    "is of 16x16 px, and the images are 8x8": [((16, 16), K8)],
+    "has a focal length of 0": [((8, 8), 0.0 * K8)],
+    "has 2 contents": [((8, 8), K8), ((8, 8), 1.1 * K8)],
+}
+
+
+@pytest.mark.parametrize("why", NOT_TAKEN)
+def test_camera_info_of_other_images_is_said_and_not_taken(why):
+    _, bag = simple("b", **{"/cam/image_raw": np.arange(0.1, 4.0, 0.1)})
+    for t, content in enumerate(NOT_TAKEN[why]):
+        bag.camera_info("/cam/camera_info", 0.5 + t, *content, LENS)
+    bag.close()
+    found = series(eye="/cam/image_raw")
+    assert found.cameras == {}
+    assert any(f"/cam/camera_info {why}" in note for note in found.notes), found.notes
+
+
+def test_camera_info_next_to_two_cameras_is_taken_for_none():
+    _, bag = simple("b", **{"/right": np.arange(0.1, 5.0, 0.1)})
+    bag.camera_info("/camera_info", 0.5, (8, 8), K8, LENS)
+    bag.close()
+    found = series(left="/left", right="/right")
+    assert found.cameras == {}
+    assert any("is next to images of several cameras" in note for note in found.notes), found.notes
+
+
+def test_files_of_cameras_are_written_next_to_the_table_and_replaced_on_request(projservo):
+    """For a calibration by them."""
+    show, bag = Show(3), Bag("b", "mcap")
+    put_readings(bag, show, "joints")
+    for t, image in show.frames()[0]:
+        bag.image("/cam/image_raw", t, image)
+        bag.camera_info("/cam/camera_info", t, SIZE, np.diag([40.0, 40.0, 1.0]) @ K8, LENS)
+    bag.close()
+    words = ["--bag", "b", "--images", "eye=/cam/image_raw", *OPTIONS["joints"], *DETECT, "-o", "t.csv"]
+    answer = projservo("detect", *words, "--json")
+    assert answer.code == 0, answer.err
+    assert answer.json["intrinsics"] == {"eye": str(Path("t_eye.yaml").resolve())}
+    np.testing.assert_array_equal(read_intrinsics("t_eye.yaml").K[:2], 40.0 * K8[:2])
+    Path("t.csv").unlink()
+    answer = projservo("detect", *words)
+    assert (answer.code, "t_eye.yaml" in answer.err, Path("t.csv").exists()) == (2, True, False)
 
 
 REFUSED = {
