@@ -210,7 +210,7 @@ def calibrate(
     joint_model : curves of the joints to fit: ``auto`` for those that the images show, or kinds such as
         ``scale``, of all or of one: ``scale:2``; a list, or a text with commas.
     boards : boards of known shape whose corners are markers, numbered row by row, each with the number of the
-        marker at its first corner, columns, rows, and perhaps the distance of neighbouring corners, m.
+        marker at its first corner, columns, rows, perhaps their distance, m, and 1 if odd rows are staggered.
     noise_px : standard deviation of a coordinate, px; by default as the observations state, otherwise
         estimated.
     seed : of the random starts; by default the seed of the observations.

@@ -279,19 +279,22 @@ class StatedBoard(NamedTuple):
     first: int  # number of the marker at its first corner
     columns: int  # of corners
     rows: int
-    pitch_m: float | None = None  # distance of neighbouring corners, m; None if unknown
+    pitch_m: float | None = None  # distance of neighbouring corners, m, or of rows if staggered, if known
+    staggered: bool = False  # whether corners of a row are two pitches apart, and odd rows one pitch on
 
     @classmethod
     def of(cls, values: Sequence[float]) -> "StatedBoard":
-        """Return the board of three or four numbers. Raises InputError if they are none."""
-        first, columns, rows, pitch = [*values, math.nan][:4] if len(values) in (3, 4) else (-1, 0, 0, 0)
+        """Return the board of three to five numbers. Raises InputError if they are none."""
+        known = 3 <= len(values) <= 5
+        more = (math.nan, 0.0)[len(values) - 3 :]
+        first, columns, rows, pitch, staggered = (*values, *more) if known else (-1, 0, 0, 0, 0)
         whole = [round(number) for number in (first, columns, rows) if math.isfinite(number)]
         if whole != [first, columns, rows] or first < 0 or min(whole[1:]) < LEAST_CORNERS or pitch <= 0.0:
             raise InputError(
                 f"boards: {values!r:.60}: give the number of the first marker, columns and rows of corners "
                 f"({LEAST_CORNERS} or more), and perhaps the distance of neighbouring corners, m"
             )
-        return cls(whole[0], whole[1], whole[2], None if math.isnan(pitch) else float(pitch))
+        return cls(whole[0], whole[1], whole[2], None if math.isnan(pitch) else float(pitch), bool(staggered))
 
     @property
     def longest(self) -> tuple[int, int]:
@@ -301,7 +304,8 @@ class StatedBoard(NamedTuple):
     def positions_of(self, markers: IntArray) -> FloatArray:
         """Places (m, 2) of markers by their numbers, in pitches along rows and columns; NaN for others."""
         at = np.asarray(markers) - self.first
-        positions = np.stack([at % self.columns, at // self.columns], axis=1).astype(np.float64)
+        u, v = at % self.columns, at // self.columns
+        positions = np.stack([2 * u + v % 2 if self.staggered else u, v], axis=1).astype(np.float64)
         positions[(at < 0) | (at >= self.columns * self.rows)] = np.nan
         return positions
 
@@ -545,8 +549,8 @@ class CalibratedBody(RecordPart):
     M: FloatArray = _array("marker coordinate", about="markers at the reference, a_inf @ M = 1")
     boards: FloatArray | None = _optional_array(
         "board number",
-        about="boards whose shape the fit uses: number of the first marker, columns, rows, and pitch in m, "
-        "NaN if unknown",
+        about="boards whose shape the fit uses: number of the first marker, columns, rows, pitch in m, "
+        "NaN if unknown, and 1 if odd rows are one pitch on",
     )
 
     def indices_of(self, numbers: Iterable[int]) -> list[int]:

@@ -65,6 +65,7 @@ _ADDED: dict[str, dict[str, Any]] = {
         "center_std_fraction": 0.01,
     },
     "Markers": {"boards": None},
+    **{name: {"staggered": False} for name in ("KnownBoard", "StatedBoard")},
     **{name: {"flange_chart": None} for name in ("JointSettings", "OwnRobot", "Table")},
 }
 # Records whose fields count as those of the record that holds them, as they did at first.

@@ -76,8 +76,8 @@ _SELDOM = 8
 @click.option(
     "--board",
     metavar="KIND:CxR",
-    help="A board instead of tags: chessboard:9x7 (inner corners) or charuco:11x8 (squares), and "
-    "charuco:11x8:first=20 if its first tag is 20.",
+    help="A board instead of tags: chessboard:9x7 (inner corners), charuco:11x8 (squares), and "
+    "charuco:11x8:first=20 if its first tag is 20, circles:9x7, acircles:4x11.",
 )
 @click.option(
     "--points",

@@ -201,7 +201,7 @@ def overrides(options: Mapping[str, Any]) -> list["Override"]:
 
         board = Board.of(text)
         rows, columns = board.shape
-        shape = {"columns": columns, "rows": rows, "pitch_mm": board.pitch_mm}
+        shape = {"columns": columns, "rows": rows, "pitch_mm": board.pitch_mm, "staggered": board.staggered}
         found.append(Override(f"--board {text}", "markers.boards", [shape]))
     found += map(Override.parse, options["sets"])  # undoes earlier overrides of its key
     if goals := options.get("goals"):

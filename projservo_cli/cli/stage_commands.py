@@ -51,8 +51,8 @@ _OF_STAGES = (
     click.option(
         "--board",
         metavar="KIND:CxR[:MMmm]",
-        help="The table's markers are corners of a board: chessboard:9x7:25mm (inner corners) or "
-        "charuco:11x8 (squares), from marker 0. A fit uses its shape.",
+        help="The table's markers are corners of a board: chessboard:9x7:25mm (inner corners), "
+        "charuco:11x8 (squares), circles:9x7 or acircles:4x11, from marker 0. A fit uses its shape.",
     ),
     click.option(
         "--intrinsics",

@@ -8,6 +8,7 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from functools import partial
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,6 +23,7 @@ from projservo_cli.records import (
     ByteArray,
     FloatArray,
     InputError,
+    StatedBoard,
     board_numberings,
 )
 
@@ -38,7 +40,11 @@ def cells_of(dictionary: str) -> int:
 
 
 # Kinds of boards, and their minimum rows and columns.
-_BOARDS, LEAST_ROWS = ("chessboard", "charuco"), 3
+_BOARDS, LEAST_ROWS = ("chessboard", "charuco", "circles", "acircles"), 3
+# Radius within which pixels are of a circle, and from which they are ground, over half of the least distance.
+_INSIDE, _GROUND = 0.2, 0.9
+# Error of the middle of a circle besides noise, px, fitted to drawn boards.
+_CIRCLE_FLOOR = 0.005
 # Share of a square that a tag takes up on a ChArUco board: as OpenCV draws it; the edges decide on corners.
 _TAG_SHARE = 0.75
 # Minimum number of corners of a board in an image, not of one line, for the directions of its edges.
@@ -482,13 +488,13 @@ class TagFinder(Finder):
 
 
 class Board(NamedTuple):
-    """A board of chessboard or ChArUco corners, counted as OpenCV does."""
+    """A board of chessboard or ChArUco corners, or a grid of circles, counted as OpenCV does."""
 
-    kind: str  # chessboard or charuco
-    rows: int  # inner corners of a chessboard, squares of a ChArUco board
+    kind: str  # chessboard, charuco, circles or acircles, whose odd rows are moved by half of a step
+    rows: int  # inner corners of a chessboard, squares of a ChArUco board, circles
     columns: int
     first: int = 0  # number of the first tag on a ChArUco board
-    pitch_mm: float | None = None  # distance of neighbouring corners, mm, if it is stated
+    pitch_mm: float | None = None  # distance of neighbouring corners, or of rows of acircles, mm, if stated
 
     @classmethod
     def of(cls, text: str) -> "Board":
@@ -498,11 +504,13 @@ class Board(NamedTuple):
         if parts is None or min(int(parts[2]), int(parts[3])) < LEAST_ROWS:
             raise InputError(
                 f"--board {text}: write kind:columnsxrows, of {LEAST_ROWS} or more, such as chessboard:9x7 "
-                "(inner corners), charuco:11x8 (squares), charuco:11x8:25mm with the side of a square, or "
-                "charuco:11x8:first=20 if its first tag is 20"
+                "(inner corners), charuco:11x8 (squares), charuco:11x8:25mm with the side of a square, "
+                "charuco:11x8:first=20 if its first tag is 20, circles:9x7 or acircles:4x11"
             )
         if parts[5] and parts[1] != "charuco":
             raise InputError(f"--board {text}: a {parts[1]} has no tags: leave out first={parts[5]}")
+        if parts[1] == "acircles" and int(parts[3]) % 2 == 0:
+            raise InputError(f"--board {text}: take an odd number of rows, as 4x11: OpenCV mixes up others")
         pitch_mm = None if parts[4] is None else float(parts[4])
         if pitch_mm == 0.0:
             raise InputError(f"--board {text}: {parts[4]}mm is no side of a square: write such as 25mm")
@@ -523,12 +531,18 @@ class Board(NamedTuple):
     @property
     def symmetric(self) -> bool:
         """Whether it looks the same turned by half a turn."""
-        return self.kind == "chessboard" and (self.rows + self.columns) % 2 == 0
+        return self.kind == "circles" or (self.kind == "chessboard" and (self.rows + self.columns) % 2 == 0)
+
+    @property
+    def staggered(self) -> bool:
+        """Whether odd rows are moved by half of a step."""
+        return self.kind == "acircles"
 
     @property
     def grid_points(self) -> FloatArray:
-        """Places (N, 2) of the corners on the board, in squares."""
-        return np.indices(self.shape)[::-1].reshape(2, -1).T.astype(np.float64)
+        """Places (N, 2) of the corners on the board, in squares, or in rows of circles."""
+        rows, columns = self.shape
+        return StatedBoard(0, columns, rows, None, self.staggered).positions_of(np.arange(rows * columns))
 
 
 class BoardFinder(Finder):
@@ -737,6 +751,60 @@ class BoardFinder(Finder):
                 yield at[k] + [0.0 * a, a, b, a + b]
 
 
+class CircleFinder(BoardFinder):
+    """Detector of a grid of circles, all of which show: dark on bright ground, or bright on dark."""
+
+    def find(self, image: FloatArray) -> tuple[dict[int, Corners], tuple[int, ...]]:
+        """Middles (N, …) of the circles in an image as tag 0; none without all of them.
+
+        image : (height, width) grey values from 0 to 255.
+        """
+        cv, (rows, columns), grey = self.cv, self.board.shape, image.astype(np.uint8)
+        blobs = cv.SimpleBlobDetector_Params()
+        blobs.maxArea, blobs.minDistBetweenBlobs = float(image.size) / self.corners, 1.0
+        grid = cv.CALIB_CB_ASYMMETRIC_GRID if self.board.staggered else cv.CALIB_CB_SYMMETRIC_GRID
+        for shade, more in product((grey, 255 - grey), (0, cv.CALIB_CB_CLUSTERING)):
+            blob = cv.SimpleBlobDetector_create(blobs)
+            found, guess = cv.findCirclesGrid(shade, (columns, rows), flags=grid | more, blobDetector=blob)
+            if found:
+                guess = guess.reshape(-1, 2).astype(np.float64)
+                if np.linalg.det(self._grid(self.board.grid_points, guess)[1][:, 0]) < 0.0:  # from behind
+                    guess = guess.reshape(rows, columns, 2)[::-1].reshape(-1, 2)
+                corners = self._smooth(self.board.grid_points, self._middles(image, guess))
+                return ({0: corners} if 2 * corners.clean.sum() > self.corners else {}), ()
+        return {}, ()
+
+    def _middles(self, image: FloatArray, guess: FloatArray) -> Corners:
+        """Middles of circles: those of grey values over the ground, carried from ellipses to circles."""
+        positions, pixels, sigma = self.board.grid_points, guess.copy(), np.full(self.corners, np.nan)
+        half, radii = np.sqrt(0.25 + 0.25 * self.board.staggered), [0.0]
+        light = np.full(self.corners, np.nan)
+        for k, J in enumerate(self._grid(positions, guess)[1].transpose(1, 2, 0)):
+            reach = half * np.linalg.norm(J, axis=1)
+            low, high = np.floor(guess[k] - reach).astype(int), np.ceil(guess[k] + reach).astype(int) + 1
+            at = np.indices(high - low).reshape(2, -1).T + low
+            far = np.linalg.norm(np.linalg.solve(J, (at - guess[k]).T), axis=0) / half
+            if (low < 0).any() or (high > image.shape[::-1]).any():
+                continue
+            at, far, grey = at[far < 1.0], far[far < 1.0], image[at[:, 1], at[:, 0]][far < 1.0]
+            plane, ground = np.column_stack([np.ones(len(at)), at - guess[k]]), far > _GROUND
+            w = grey - plane @ np.linalg.lstsq(plane[ground], grey[ground])[0]
+            light[k] = np.median(w[far <= max(_INSIDE, far.min())])
+            if not (area := w.sum() / light[k]) > 0.0:
+                continue
+            pixels[k], spread = w @ at / w.sum(), np.square(at - guess[k]).sum(axis=1) / 2.0
+            # Pixels of the ground take part in its slope, which errs too.
+            error = w[ground].std() * np.sqrt(spread.sum() * (spread.sum() / spread[ground].sum() - 1.0))
+            sigma[k] = np.hypot(_CIRCLE_FLOOR, error / abs(w.sum()))
+            radii.append(np.sqrt(area / (np.pi * abs(np.linalg.det(J)))))
+        H = self.cv.findHomography(positions, guess)[0]
+        ends = np.column_stack([positions, np.ones(self.corners)]) @ H.T
+        ellipse = ends[:, :, None] * ends[:, None] - np.median(radii) ** 2 * (H[:, :2] @ H[:, :2].T)
+        pixels -= ellipse[:, :2, 2] / ellipse[:, 2:, 2] - ends[:, :2] / ends[:, 2:]
+        sigma[np.abs(light / np.nanmedian([*light, 1.0]) - 1.0) > _UNLIKE] = np.nan
+        return Corners(pixels, sigma, np.isfinite(sigma))
+
+
 def _refine_saddles(
     image: FloatArray, guess: FloatArray, steps: FloatArray, cross: float
 ) -> tuple[Corners, FloatArray]:
@@ -831,7 +899,9 @@ def _saddle_model(
 def finder_of(board: Board | None, dictionary: str | None) -> Finder:
     """Detector of a board, or of tags if there is none; of the tags of ``DICTIONARY`` without a name."""
     name = dictionary or DICTIONARY
-    return TagFinder(name) if board is None else BoardFinder(board, name)
+    if board is None or "circles" not in board.kind:
+        return TagFinder(name) if board is None else BoardFinder(board, name)
+    return CircleFinder(board, name)
 
 
 def _dictionary(name: str) -> Any:

@@ -102,8 +102,8 @@ ROBOTS: dict[str, Row] = (
         repeated_tag=("{markers} is there twice", _UNIQUE),
         no_board=(
             "no {name} in {any_image}",
-            "check its kind and that it is counted in inner corners (chessboard) or squares (charuco), "
-            "columns before rows, and show each side of a chessboard",
+            "check its kind and that it is counted in inner corners (chessboard), circles, or "
+            "squares (charuco), columns before rows, and show each side of a chessboard",
         ),
         mirrored_image=(
             "the {view} camera's image is mirrored: it shows no tag, its mirror image {tags}",

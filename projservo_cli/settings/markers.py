@@ -6,7 +6,7 @@ from itertools import pairwise
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, PlainValidator, Strict, WithJsonSchema
+from pydantic import Field, PlainValidator, Strict, StrictBool, WithJsonSchema
 from scipy.spatial.transform import Rotation
 
 from projservo_cli.detection.finders import LEAST_ROWS, Board
@@ -61,10 +61,12 @@ _Side = Annotated[int, Strict(), Field(ge=LEAST_ROWS, le=1000)]
 class BoardSettings(Section):
     """A board on the tool, or in the scene of cameras on the tool, whose inner corners are the markers."""
 
-    kind: Literal["chessboard", "charuco"] = Field(description="pattern of the board")
-    rows: _Side = Field(description="rows of inner corners of a chessboard, of squares of a ChArUco board")
+    kind: Literal["chessboard", "charuco", "circles", "acircles"] = Field(description="pattern of the board")
+    rows: _Side = Field(description="rows of inner corners or circles, or of squares of a ChArUco board")
     columns: _Side = Field(description="columns, counted likewise")
-    size_m: Positive | None = Field(None, description="side of a square; null if unknown")
+    size_m: Positive | None = Field(
+        None, description="side of a square, distance of rows of circles; null if unknown"
+    )
     dictionary: Text | None = Field(
         None, description="of the tags on a ChArUco board by its OpenCV name; null: 4X4_50"
     )
@@ -77,8 +79,8 @@ class BoardSettings(Section):
 
     def contradictions(self) -> Iterator[Note]:
         """Tags of a board without."""
-        for key in self.given("dictionary", "first") if self.kind == "chessboard" else ():
-            yield (key,), "is of the tags on a board of kind charuco, and a chessboard has none"
+        for key in self.given("dictionary", "first") if self.kind != "charuco" else ():
+            yield (key,), f"is of the tags on a board of kind charuco, and {self.kind} has none"
 
 
 _Corners = Annotated[int, Strict(), Field(ge=LEAST_CORNERS, le=1000)]
@@ -90,13 +92,18 @@ class KnownBoard(Section):
     first: Whole = Field(0, description="number of the marker at its first corner")
     columns: _Corners = Field(description="corners in a row, of a chessboard its inner ones")
     rows: _Corners = Field(description="rows of corners")
-    pitch_mm: Positive | None = Field(None, description="distance of neighbouring corners; null if unknown")
+    pitch_mm: Positive | None = Field(
+        None, description="distance of neighbouring corners, or of rows if staggered; null if unknown"
+    )
+    staggered: StrictBool = Field(
+        False, description="whether odd rows are moved by half of a step, as in asymmetric grids of circles"
+    )
 
     @property
     def stated(self) -> StatedBoard:
         """The board as a calibration takes it."""
         pitch_m = None if self.pitch_mm is None else 1e-3 * self.pitch_mm
-        return StatedBoard(self.first, self.columns, self.rows, pitch_m)
+        return StatedBoard(self.first, self.columns, self.rows, pitch_m, self.staggered)
 
 
 def _tag(number: int, size_m: float, R: Rotation, t: Sequence[float]) -> Tag:
@@ -199,7 +206,7 @@ class Markers(Section):
         if self.board is None:
             return known
         rows, columns = self.board.pattern.shape
-        return (*known, StatedBoard(0, columns, rows, self.board.size_m))
+        return (*known, StatedBoard(0, columns, rows, self.board.size_m, self.board.pattern.staggered))
 
     @property
     def tag_dictionary(self) -> str | None:

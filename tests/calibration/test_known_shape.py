@@ -88,7 +88,7 @@ def test_a_known_shape_predicts_at_its_own_bound(mount):
     rng = np.random.default_rng(1)
     free, held = (by_flange(np.random.default_rng(2), mount, boards=one) for one in ((), (EIGHT_BY_SIX,)))
     assert free.boards is None
-    assert held.boards.tolist() == [[0.0, 8.0, 6.0, flange.PITCH]]
+    assert held.boards.tolist() == [[0.0, 8.0, 6.0, flange.PITCH, 0.0]]
     T, rms = flange.poses(rng, 40), []
     for found in (free, held):
         q = FlangeChart.from_record(found.flange_chart).coordinates(T)
@@ -97,6 +97,26 @@ def test_a_known_shape_predicts_at_its_own_bound(mount):
         stated = np.sqrt(prediction_variance(found, q).sum(axis=-1).mean())
         assert stated / 1.4 < rms[-1] < 1.4 * stated
     assert rms[1] < rms[0] / 1.5
+
+
+STAGGERED = StatedBoard(0, 4, 12, 0.02, staggered=True)
+
+
+def lattice(X):
+    """Circles (48, 3) of a grid whose odd rows are one pitch on, as OpenCV has its points, m."""
+    u, v = np.meshgrid(np.arange(4), np.arange(12))
+    return np.c_[0.02 * (2 * u + v % 2 - 3.5).ravel(), 0.02 * (v.ravel() - 5.5), np.zeros(48)]
+
+
+def test_the_shape_of_an_asymmetric_grid_is_its_own_and_no_other():
+    """It is taken as it is, and refuted as rows without a shift, by the same images."""
+    found = by_flange(np.random.default_rng(0), shape=lattice, boards=(STAGGERED,))
+    assert [StatedBoard.of(one) for one in found.boards.tolist()] == [STAGGERED]
+    assert not {one.code for one in found.findings} & {"unused_shape", "other_pitch"}
+    other = by_flange(np.random.default_rng(0), shape=lattice, boards=(STAGGERED._replace(staggered=False),))
+    assert other.boards is None
+    assert "unused_shape" in {one.code for one in other.findings}
+    assert StatedBoard.of([0, 4, 12]) == STAGGERED._replace(pitch_m=None, staggered=False)
 
 
 OTHERWISE = {

@@ -6,6 +6,7 @@ import pytest
 cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed: pip install '.[detect]'")
 
 SIZE, CELL, FACTOR = (640, 480), 60, 4  # px; samples a square of the picture and a pixel
+RADIUS = 0.32  # of a circle, in squares
 DICTIONARY = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_250)
 
 
@@ -16,6 +17,12 @@ def picture(board):
         printed = cv2.aruco.CharucoBoard((board.columns, board.rows), 1.0, 0.7, DICTIONARY, tags)
         size = [CELL * (n + 2) for n in (board.columns, board.rows)]
         grey = printed.generateImage(size, marginSize=CELL)
+    elif "circles" in board.kind:
+        corners = CELL * (board.grid_points + 2) - 0.5
+        grey = np.full((np.ceil(corners.max(axis=0)[::-1]) + 2 * CELL).astype(int), 255.0)
+        at = np.indices(grey.shape)[::-1]
+        for corner in corners:
+            grey[np.linalg.norm(at - corner[:, None, None], axis=0) < RADIUS * CELL] = 0.0
     else:
         squares = np.indices((board.rows + 1, board.columns + 1)).sum(axis=0) % 2
         grey = np.pad(np.kron(255 * squares, np.ones((CELL, CELL))), CELL, constant_values=255)
