@@ -1,5 +1,6 @@
 """An independent robot, rig and marker body: matrix exponentials by scipy, nothing of the package."""
 
+import json
 from dataclasses import dataclass
 
 import numpy as np
@@ -7,6 +8,7 @@ import numpy.typing as npt
 from scipy.linalg import expm
 
 from projservo_cli.records import FloatArray, Observation
+from tests.conftest import SHARED
 from tests.samples import prismatic, revolute
 
 IMAGE_SIZE = (1280, 1024)
@@ -45,6 +47,18 @@ class Robot:
         images = images + np.reshape(sigma, (-1, 1, 1)) * rng.standard_normal(images.shape)
         m, view = len(self.markers), NAMES[: len(self.cameras)]
         return Observation(3 + 2 * np.arange(len(q)), 5 + 3 * np.arange(m), q.copy(), images, view=view)
+
+
+def reference_ur5(cameras: int = 2) -> Robot:
+    """The true UR5 of the reference data before so many of its cameras."""
+    truth = json.loads((SHARED / "ur5" / "truth.json").read_text(encoding="utf-8"))
+    twists = np.zeros((len(truth["screws"]), 4, 4))
+    for twist, screw in zip(twists, truth["screws"], strict=True):
+        twist[:3, :3], twist[:3, 3] = np.cross(np.eye(3), screw["w"]), screw["v"]
+    places = np.c_[truth["markers_tool"], np.ones(len(truth["markers_tool"]))]
+    P = np.array([truth["camera_left"], truth["camera_right"]])[:cameras]
+    markers = places @ np.transpose(truth["T_base_tool_at_reference"])
+    return Robot(truth["joint_types"], twists, P, markers, np.array(truth["q_reference"]))
 
 
 def rig(baseline: float = 0.3, distance: float = 1.4, focal: float = 1200.0, views: int = 2) -> FloatArray:

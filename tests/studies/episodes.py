@@ -19,8 +19,8 @@ from scipy.linalg import expm
 
 from projservo_cli.detection.stretches import stretches
 from projservo_cli.records import Observation
+from tests.calibration.simulated_robot import reference_ur5
 from tests.studies.common import in_two_processes, parser_of, rate, written
-from tests.studies.one_camera import RIGS, robot_of
 
 SEED, EPISODES, POSES = 611, 20, 15
 NOISE_PX, HIDDEN, JOINTS_RAD, TWICE_RAD = 0.3, 0.2, np.radians(0.05), np.radians(0.1)
@@ -56,7 +56,7 @@ def observed(number, moves):
     """Observation of a draw, episodes of its poses, what moved, and by how much, px."""
     rng = np.random.default_rng([SEED, number, moves])
     kind = number % len(KINDS)
-    robot = robot_of(RIGS["ur5"], 1 if kind == 0 else 2)
+    robot = reference_ur5(1 if kind == 0 else 2)
     q, episode = teleoperated(robot, rng)
     true = q + JOINTS_RAD * rng.standard_normal(q.shape)
     true += TWICE_RAD * np.sin(2 * q + rng.uniform(0, 2 * np.pi, q.shape[1]))

@@ -14,14 +14,16 @@ compared with what the run states, and the sense in which features point.
 import numpy as np
 
 from projservo_cli.records import WorkFailed
+from projservo_cli.settings.features import Feature
 from projservo_cli.simulation import random_tasks as drawing
 from projservo_cli.stages.scenario import run_scenario
 from projservo_cli.task.incidence_errors import Separation, angle_off
 from tests.configured import plan, servo, servo_inputs, truth_of
 from tests.known import with_task
 from tests.studies.common import in_two_processes, jobs_of, parser_of, quantiles, rate, write_rows
-from tests.studies.lists import MARKERS, features
 
+# Markers of a point, of another one on a line through it, and of a plane off it.
+MARKERS = {"paper": (8, 4, (5, 7, 9)), "ur5": (8, 4, (5, 7, 9)), "hobby": (4, 6, (5, 6, 7))}
 # Incidences of each kind: a feature of the tool, that of the scene, and how they are to lie.
 KINDS = {
     "pose": (),
@@ -39,6 +41,16 @@ LAWS = ("exact_track", "incidences")
 STARTS = {"random": None, "0.7": 0.7, "1.6": 1.6}
 SEEDS = {"paper": 251, "ur5": 252, "hobby": 253}
 TRIES = 2000  # starts that are drawn until the cameras see the face
+
+
+def features(arm):
+    """Features of the tool by its markers, and those of the scene where they were taught."""
+    point, third, plane = MARKERS[arm]
+    shown = {"point": {"point": (point,)}, "line": {"line": (point, third)}, "plane": {"plane": plane}}
+    of_tool = {name: Feature(on="tool", **kind) for name, kind in shown.items()}
+    return of_tool | {
+        f"{name}_there": Feature(on="scene", **dict.fromkeys(kind, name)) for name, kind in shown.items()
+    }
 
 
 def task_of(config, arm, kind):

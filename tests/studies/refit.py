@@ -31,11 +31,11 @@ from projservo_cli.calibration.prediction import (
 )
 from projservo_cli.calibration.refit import refit
 from projservo_cli.records import WorkFailed
-from tests.calibration.simulated_robot import around, trials
+from tests.calibration.simulated_robot import around, reference_ur5, trials
 from tests.studies.common import in_two_processes, parser_of, written
-from tests.studies.one_camera import COMBINED, FRAMES, RIGS, robot_of
 
 SEED, NOISE_PX, HELD_OUT = 506, 0.5, 20
+FRAMES, COMBINED = 6, 12  # of each joint, and combined poses
 RANGES_DEG, POSES = (45, 8), (5, 10, 20)
 TURN_RAD, SHIFT_M = np.radians(3.0), 0.03
 EACH = 5  # draws of a calibration
@@ -88,7 +88,7 @@ def refusal(before, seen):
 
 def drawn(number):
     """Rows of the table of one calibration: its draws, and one of a whole recalibration."""
-    rng, robot = np.random.default_rng([SEED, number]), robot_of(RIGS["ur5 combined"], 2)
+    rng, robot = np.random.default_rng([SEED, number]), reference_ur5()
     q, how = (
         np.concatenate([trials(robot, frames=FRAMES), around(robot, COMBINED, rng)]),
         {"source": "simulated", "sigma_px": NOISE_PX},
@@ -111,7 +111,7 @@ def drawn(number):
 
 def asked_in_vain(number):
     """Rows of one calibration, fitted again where a joint slipped, and where nothing happened."""
-    rng, robot = np.random.default_rng([SEED, number, 1]), robot_of(RIGS["ur5 combined"], 2)
+    rng, robot = np.random.default_rng([SEED, number, 1]), reference_ur5()
     q = np.concatenate([trials(robot, frames=FRAMES), around(robot, COMBINED, rng)])
     before = calibrate(
         robot.observe(q, NOISE_PX, rng), robot.joint_types, source="simulated", sigma_px=NOISE_PX
