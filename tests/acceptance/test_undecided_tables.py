@@ -49,7 +49,8 @@ def test_case_15_sentinel_9999(case, answer):
     assert "u = 9999, v = 9999" in err
 
 
-def test_case_01_joint_order(case, answer, tmp_path):
+def test_case_01_joint_order(case, answer):
+    """Poses in which several joints move show the exchange: tests/calibration/test_mislabelled_data.py."""
     folder = case("01_joint_order")
     code, found, _ = answer("calibrate", "--data", folder / "trials.csv", "-o", "a")
     assert (code, found["usable"], found["order_determined"]) == (0, True, False)
@@ -57,13 +58,6 @@ def test_case_01_joint_order(case, answer, tmp_path):
     assert found["advice"][-1].startswith(
         "these poses cannot confirm the order of joints 1, 2, 3, 4, 5 and 6"
     )
-    # With the poses in which several move, the exchanged columns show.
-    trials, held = ((folder / name).read_text(encoding="utf-8") for name in ("trials.csv", "held.csv"))
-    combined = "\n".join(f"500{line}" for line in held.splitlines()[101:])
-    (tmp_path / "both.csv").write_text(f"{trials.rstrip()}\n{combined}\n", encoding="utf-8")
-    code, failed, _ = answer("calibrate", "--data", "both.csv", "-o", "b")
-    assert code == 1
-    assert "joint" in failed["reason"]
 
 
 UR5 = ROOT / "configs" / "ur5.yaml"

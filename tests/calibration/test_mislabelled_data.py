@@ -26,13 +26,10 @@ def refused(observation, types=TYPES):
     return caught.value.findings[0]
 
 
-@pytest.mark.parametrize("pair", [(0, 1)])
-def test_joints_in_the_place_of_each_other_are_named(pair):
+def test_joints_in_the_place_of_each_other_are_named():
     robot, q, rng = recorded(1)
-    order = np.arange(3)
-    order[[*pair]] = pair[::-1]
-    one = refused(dataclasses.replace(robot.observe(q, SIGMA, rng), q=q[:, order]))
-    assert (one.code, one.subject.joints) == ("exchanged_joints", tuple(i + 1 for i in pair))
+    one = refused(dataclasses.replace(robot.observe(q, SIGMA, rng), q=q[:, [1, 0, 2]]))
+    assert (one.code, one.subject.joints) == ("exchanged_joints", (1, 2))
 
 
 def test_a_joint_that_keeps_the_direction_of_its_link_is_a_parallelogram():
@@ -166,7 +163,7 @@ def test_a_cyclic_error_is_named_by_its_period_and_stated():
 
 @pytest.mark.parametrize(
     ("step", "onset", "code"),
-    [(-1, 25, "images_late_from"), (1, 25, "images_early_from"), (-1, 17, "images_late_from")],
+    [(1, 25, "images_early_from"), (-1, 17, "images_late_from")],
 )
 def test_images_that_come_late_or_early_from_a_pose_on_are_named(step, onset, code):
     """In the last table a fit rejects no part of the poses that would tell from where on."""

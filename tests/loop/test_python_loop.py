@@ -35,25 +35,21 @@ def both(sc, law, bounds, noise, G=None, task=None, gains=GAINS):
     return compiled
 
 
-@pytest.mark.parametrize(
-    ("law", "types"), [*((law, "RRRRRR") for law in FACE_LAWS), ("direct_two", "RRPRRR")]
-)
-def test_both_loops_are_equal_to_the_bit(law, types, rng):
-    """With noise, a speed limit that is active, and a projective model for the laws that take one."""
-    G = None if LAW_SPECS[law].metric else frame(2)
-    noise = 0.3 * rng.normal(size=(41, 2, 4, 2))
-    run = both(scene(types=types), law, limits(speed=np.full(6, 0.5), max_steps=40), noise, G)
-    assert (run.full.factor < 1).any()
+RUNS = [
+    *((law, "RRRRRR", False) for law in FACE_LAWS),
+    ("direct_two", "RRPRRR", False),
+    *((law, "RRRRRR", True) for law in FOLLOWING),
+]
 
 
-@pytest.mark.parametrize("law", FOLLOWING)
-def test_both_loops_follow_a_plan_alike(law, rng):
-    """With noise, a joint-speed limit that is active, and periods in which the face is lost."""
-    sc, G = scene(), frame(2)
+@pytest.mark.parametrize(("law", "types", "follows"), RUNS)
+def test_both_loops_are_equal_to_the_bit(law, types, follows, rng):
+    """With noise, an active speed limit, a face that is lost, and a projective model where one is taken."""
+    sc, G = scene(types=types), None if LAW_SPECS[law].metric else frame(2)
     bounds = limits(speed=np.full(6, 0.4), max_steps=60, max_lost_periods=5)
     noise = 0.3 * rng.normal(size=(61, 2, 4, 2))
     noise[7:10, 0, 1] = np.nan
-    run = both(sc, law, bounds, noise, G, tracked(sc, G))
+    run = both(sc, law, bounds, noise, G, tracked(sc, G) if follows else None)
     assert (run.full.factor < 1).any()
     assert (run.full.q[7:10] == run.full.q[7]).all()
 

@@ -1,6 +1,5 @@
 """Servo and record with robots and laws of others, on the command line."""
 
-import io
 from dataclasses import replace
 from pathlib import Path
 
@@ -256,7 +255,6 @@ def test_joint_limits_end_a_run_whatever_is_configured(calibrated):
         ),
         (f"{HERE}:Raising", 1, "failed: IndexError: list index out of range (robots.py:"),
         (f"{HERE}:Nobody", 2, "tests.robots.robots has no Nobody"),
-        ("direct_thre", 2, "no such law; did you mean direct_three? laws: direct_three"),
     ],
 )
 def test_a_law_that_fails_or_lacks_a_limit(servo, law, code, message):
@@ -284,14 +282,6 @@ def test_confirm_asks_before_the_first_motion(servo, monkeypatch, answered, code
     assert moved == 0
     assert ("servo will move tests.robots.robots:Sound, speeds times 0.5" in answer.err) or asked[0][0]
     assert bool(commands()) == (code == 0)
-
-
-def test_confirm_needs_a_terminal(servo, monkeypatch):
-    monkeypatch.setattr("sys.stdin", io.StringIO("y\n"))
-    answer = servo(*SOUND, "--confirm")
-    assert answer.code == 2
-    assert "--confirm: standard input is no terminal" in answer.err
-    assert commands() == []
 
 
 def test_a_report_never_moves_a_robot(servo, projservo):

@@ -137,21 +137,17 @@ def in_two_processes(function, jobs, what, processes=2):
 
 
 def written(path, columns, batches):
-    """All rows of batches, each written to a table as soon as it comes."""
+    """All rows of batches, in a table that holds what has come so far; columns of the rows where None."""
     every = []
-    with open(path, "w", encoding="utf-8", newline="") as file:
-        table = csv.DictWriter(file, columns)
-        table.writeheader()
-        for rows in batches:
-            table.writerows(rows)
-            file.flush()
-            every += rows
+    for rows in batches:
+        every += rows
+        write_rows(path, every, columns)
     return every
 
 
-def write_rows(path, rows):
+def write_rows(path, rows, columns=None):
     """Rows of a table as CSV."""
     with open(path, "w", encoding="utf-8", newline="") as file:
-        writer = csv.DictWriter(file, list(dict.fromkeys(name for row in rows for name in row)))
+        writer = csv.DictWriter(file, columns or list(dict.fromkeys(name for row in rows for name in row)))
         writer.writeheader()
         writer.writerows(rows)

@@ -20,7 +20,7 @@ from projservo_cli.stages.scenario import run_scenario
 from projservo_cli.task.incidence_errors import Separation, angle_off
 from tests.configured import plan, servo, servo_inputs, truth_of
 from tests.known import with_task
-from tests.studies.common import in_two_processes, jobs_of, parser_of, quantiles, rate, write_rows
+from tests.studies.common import in_two_processes, jobs_of, parser_of, quantiles, rate, written
 
 # Markers of a point, of another one on a line through it, and of a plane off it.
 MARKERS = {"paper": (8, 4, (5, 7, 9)), "ur5": (8, 4, (5, 7, 9)), "hobby": (4, 6, (5, 6, 7))}
@@ -148,10 +148,7 @@ def main():
     choices = {"arms": (MARKERS, ["paper", "ur5"]), "kinds": KINDS, "starts": (STARTS, ["random"])}
     given = parser_of("incidences_study", __doc__, numbers, **choices).parse_args()
     jobs = list(jobs_of(given.arms, given.tasks, given.kinds, given.starts))
-    rows = []
-    for mine in in_two_processes(driven, jobs, "tasks"):
-        rows += mine
-        write_rows(given.output, rows)  # what is cut off leaves what was driven
+    rows = written(given.output, None, in_two_processes(driven, jobs, "tasks"))
     for arm in given.arms:
         for start in given.starts:
             for law in LAWS:

@@ -32,7 +32,7 @@ from projservo_cli.simulation.robot_with_faults import obstruction_of
 from tests.configured import plan, robot_by_itself, servo, truth_of
 from tests.known import with_task
 from tests.studies import hand_eye
-from tests.studies.common import in_two_processes, parser_of, quantiles, row_of, tasks_in, write_rows
+from tests.studies.common import in_two_processes, parser_of, quantiles, row_of, tasks_in, write_rows, written
 from tests.studies.rendered import calibrated
 from tests.studies.rendered_conditions import ARM, FRONT, base_of, taught_images
 
@@ -287,10 +287,7 @@ def main():
         for name in given.conditions
         for seed in list(SEEDS)[: min(given.tasks, CONDITIONS[name])]
     ]
-    rows = []
-    for row in in_two_processes(driven, jobs, "tasks"):
-        rows.append(row)
-        write_rows(given.output, rows)  # what is cut off leaves what was driven
+    rows = written(given.output, None, ([row] for row in in_two_processes(driven, jobs, "tasks")))
     for condition in given.conditions:
         mine = [row for row in rows if row["condition"] == condition]
         done = [row for row in mine if row["in"]]

@@ -15,7 +15,7 @@ import numpy as np
 
 from tests.configured import scenario_of, truth_of
 from tests.studies import visp
-from tests.studies.common import in_two_processes, parser_of, write_rows
+from tests.studies.common import in_two_processes, parser_of, written
 from tests.studies.rendered import calibrated, near, run_of
 from tests.studies.rendered_conditions import LATEST, SEEDS, base_of, task_config, tasks_of
 
@@ -46,13 +46,11 @@ def main():
     seen, calibration, why = calibrated(config)
     if calibration is None:
         raise SystemExit(why)
-    truth, rows = truth_of(config), []
+    truth = truth_of(config)
     cells = {"true": visp.true_cell(truth), "calibrated": visp.calibrated_cell(truth, seen)}
     visp.Program().close()  # compiles it once for all processes
     jobs = [(seed, calibration, cells) for seed in list(SEEDS)[: given.tasks]]
-    for mine in in_two_processes(driven, jobs, "tasks"):
-        rows += mine
-        write_rows(given.output, rows)  # what is cut off leaves what was driven
+    rows = written(given.output, None, in_two_processes(driven, jobs, "tasks"))
     print(f"| law | arrived of {given.tasks} | median error of these | else |\n|---|---|---|---|")
     for by in dict.fromkeys(row["by"] for row in rows):
         mine = [row for row in rows if row["by"] == by]

@@ -27,7 +27,7 @@ from projservo_cli.simulation.robot_with_faults import FaultyRobot
 from tests.configured import calibrate, observed_in_frames, plan, record, robot_by_itself, servo, truth_of
 from tests.conftest import ROOT
 from tests.studies import hand_eye
-from tests.studies.common import in_two_processes, parser_of, quantiles, write_rows
+from tests.studies.common import in_two_processes, parser_of, quantiles, written
 from tests.studies.conditions import NEAR_DEG, NEAR_MM, errors
 from tests.studies.rendered_conditions import (
     CONDITIONS,
@@ -261,10 +261,7 @@ def main():
         if n:
             print(f"corners of {low} to {high} px: {n:.0f}, off over stated {math.sqrt(square / n):.2f}")
     jobs = [(name, seed, *both) for name, both in made.items() for seed in list(SEEDS)[: given.tasks]]
-    rows = []
-    for mine in in_two_processes(driven, jobs, "tasks"):
-        rows += mine
-        write_rows(given.output, rows)  # what is cut off leaves what was driven
+    rows = written(given.output, None, in_two_processes(driven, jobs, "tasks"))
     for condition in made:
         tell(condition, [row for row in rows if row["condition"] == condition])
 

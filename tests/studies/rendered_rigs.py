@@ -19,7 +19,7 @@ from projservo_cli.settings.markers import Markers
 from projservo_cli.simulation.arm import camera_center
 from tests.configured import truth_of
 from tests.known import configured, with_task
-from tests.studies.common import in_two_processes, parser_of, quantiles, tasks_in, write_rows
+from tests.studies.common import in_two_processes, parser_of, quantiles, tasks_in, write_rows, written
 from tests.studies.rendered import by_hand_eye, calibrated, known_by_hand_eye, run_of, tell
 from tests.studies.rendered_conditions import ARM, FRAMES, FRONT, SEEDS, SHOWN_FRAMES, drawn
 
@@ -152,7 +152,7 @@ def main():
     if given.draw:
         write_rows(TASKS, [row for mine in in_two_processes(drawn_of, list(RIGS), "rigs") for row in mine])
         return
-    made, rows = {}, []
+    made = {}
     for rig, calibration, why, known in in_two_processes(recorded, given.rigs, "recordings"):
         if calibration is None:
             print(f"{rig}: no calibration: {why}", flush=True)
@@ -165,9 +165,7 @@ def main():
         for seed in list(SEEDS)[given.first - 1 :][: given.tasks]
         for rig, both in made.items()
     ]
-    for mine in in_two_processes(driven, jobs, "tasks"):
-        rows += mine
-        write_rows(given.output, rows)  # what is cut off leaves what was driven
+    rows = written(given.output, None, in_two_processes(driven, jobs, "tasks"))
     for rig in made:
         mine = [row for row in rows if row["rig"] == rig]
         tell(rig, mine)
