@@ -46,10 +46,10 @@ def test_a_joint_that_keeps_the_direction_of_its_link_is_a_parallelogram():
 
 
 def test_a_joint_in_degrees_is_named():
-    robot, q, rng = recorded(3)
+    robot, q, rng = recorded(3, "RR")
     given = q.copy()
     given[:, 1] = np.degrees(q[:, 1])
-    one = refused(dataclasses.replace(robot.observe(q, SIGMA, rng), q=given))
+    one = refused(dataclasses.replace(robot.observe(q, SIGMA, rng), q=given), "RR")
     assert (one.code, one.subject.joints, one.subject.name) == ("joint_unit", (2,), "degrees")
 
 
@@ -167,11 +167,11 @@ def test_a_cyclic_error_is_named_by_its_period_and_stated():
 )
 def test_images_that_come_late_or_early_from_a_pose_on_are_named(step, onset, code):
     """In the last table a fit rejects no part of the poses that would tell from where on."""
-    robot, q, rng = recorded(9)
+    robot, q, rng = recorded(9, "RR")
     seen = robot.observe(q, SIGMA, rng)
     images, last = seen.images.copy(), len(q) - max(step, 0)
     images[onset:last] = seen.images[onset + step : last + step]
-    one = refused(dataclasses.replace(seen, images=images))
+    one = refused(dataclasses.replace(seen, images=images), "RR")
     assert one.code == code
     assert abs(one.subject.poses[0] - seen.pose[onset]) <= 1
 
@@ -229,11 +229,11 @@ def test_a_pose_at_which_all_cameras_are_off_alike_is_of_the_arm():
 
 def test_a_tracker_that_keeps_much_is_named_with_its_share():
     """Of what it keeps a fit rejects most poses: images without it fit, by the share within a tenth of it."""
-    robot, q, rng = recorded(14)
+    robot, q, rng = recorded(14, "RR")
     seen, share = robot.observe(rng.permutation(q), SIGMA, rng), 0.15
     images = seen.images.copy()
     for k in range(1, len(images)):
         images[k] = (1.0 - share) * seen.images[k] + share * images[k - 1]
-    one = refused(dataclasses.replace(seen, images=images))
+    one = refused(dataclasses.replace(seen, images=images), "RR")
     assert one.code == "tracker_memory"
     assert one.amount == pytest.approx(share, rel=0.1)
