@@ -35,16 +35,12 @@ def with_known_intrinsics(
     free: Solution, cameras: KnownCameras, expected: Expected
 ) -> tuple[Solution, list[Finding]]:
     """Fit with the intrinsics that the images do not contradict; findings on the others."""
-    every = np.ones(len(cameras.K), dtype=np.bool_)
-    solution = _agreeing(free, cameras, every, expected)
-    if solution is not None:
-        return solution, []
-    alone = [_agreeing(free, cameras, one, expected) is not None for one in np.diag(every)]
-    good = np.array(alone) & (len(every) > 1)
-    solution = _agreeing(free, cameras, good, expected) if good.any() else None
-    if solution is None:
-        good[:] = False
-    return solution or free, list(_contradicted(free, cameras, ~good, expected.noise_px(free)))
+    which = np.ones(len(cameras.K), dtype=np.bool_)
+    if (solution := _agreeing(free, cameras, which, expected)) is None:  # which of them it is
+        which = np.array([_agreeing(free, cameras, one, expected) is not None for one in np.diag(which)])
+        solution = _agreeing(free, cameras, which, expected) if which.any() else None
+    unused = ~which | (solution is None)
+    return solution or free, list(_contradicted(free, cameras, unused, expected))
 
 
 def _agreeing(free: Solution, cameras: KnownCameras, which: BoolArray, expected: Expected) -> Solution | None:
@@ -59,14 +55,14 @@ def _agreeing(free: Solution, cameras: KnownCameras, which: BoolArray, expected:
 
 
 def _contradicted(
-    free: Solution, cameras: KnownCameras, which: BoolArray, noise_px: float
+    free: Solution, cameras: KnownCameras, which: BoolArray, expected: Expected
 ) -> Iterator[Finding]:
     """Yield a finding for each of some views (V,), by the entry farthest off within both deviations."""
-    K, shared = intrinsics_of(free.params.P)[:, *UPPER], free.errors().shared
-    stated = cameras.K[:, *UPPER]
+    K, stated = intrinsics_of(free.params.P)[:, *UPPER], cameras.K[:, *UPPER]
     for v in np.flatnonzero(which):
-        rows = intrinsics_derivative(free.params.P[v]) @ shared[v * CAMERA : (v + 1) * CAMERA]
-        shown = noise_px * np.linalg.norm(rows, axis=1)
+        by_camera = free.errors().shared[v * CAMERA : (v + 1) * CAMERA]
+        rows = intrinsics_derivative(free.params.P[v]) @ by_camera
+        shown = expected.noise_px(free) * np.linalg.norm(rows, axis=1)
         i = int(np.argmax(np.abs(K[v] - stated[v]) / np.hypot(shown, cameras.deviation[v])))
         subject = Subject(views=(free.problem.detections.view[int(v)],), name=_ENTRIES[i])
         about = float(K[v, i]), float(shown[i]), float(stated[v, i])

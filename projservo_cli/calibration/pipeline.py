@@ -191,8 +191,6 @@ def calibrate(
         raise InputError(f"joint noise {joint_noise!r}: give a number that is not negative, or none")
     if mount not in (WORLD, TOOL):
         raise InputError(f"mount {mount!r}: choose {WORLD} or {TOOL}")
-    if lens and cameras is not None:
-        raise InputError("lenses are known and to be estimated (--intrinsics, --lens): leave one out")
     if mount == TOOL and init is not None:
         raise InputError("cameras on the tool are calibrated from images alone: leave out init")
     curves = None if joint_model == AUTO else hypotheses_of(joint_model or (), joint_types, mount)

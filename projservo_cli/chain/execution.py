@@ -149,12 +149,13 @@ class Chain:
         """Read the table of a calibration that is to be made: what is wrong with it comes before all work."""
         for step in self._outdated:
             if step.stage == "calibrate" and self.config.recorded:
-                from projservo_cli.stages.calibrate import recorded
+                from projservo_cli.stages.calibrate import known_cameras, recorded
 
                 inputs = step.record or inputs_of("calibrate", self.config)
                 if isinstance(source := getattr(inputs, "source", None), Table):
                     with suppress(WorkFailed):  # which making it reports
                         self.table = recorded(source)
+                        known_cameras(self.table, inputs.estimation)
 
     def make(self) -> None:
         """Make the outdated results, stop at the first failure, keep finished results."""

@@ -240,10 +240,7 @@ def _of_bag(
     joint_names: tuple[str, ...],
     near: tuple[Path, bool],
 ) -> tuple["ImageSeries", dict[str, Any]]:
-    """Images and readings of a bag, which stays open until the command ends, and what else to report.
-
-    near : table next to which files of cameras are written, and whether to replace them.
-    """
+    """Images and readings of a bag, open until the command ends, and a report; cameras near a table."""
     from projservo_cli.detection.bags import bag_series, open_bag
     from projservo_cli.store.camera_files import camera_info
     from projservo_cli.store.files_and_locks import write_whole
@@ -260,8 +257,7 @@ def _of_bag(
     for path in files.values():
         option.require_new(path, force=near[1])
     for name, path in files.items():
-        K, coefficients, model, size = found.cameras[name]
-        write_whole(path, camera_info(name, K, coefficients, size, model))
+        write_whole(path, camera_info(name, *found.cameras[name]))
     known = [f"CameraInfo of {name}: {path}, for calibrate --intrinsics" for name, path in files.items()]
     for note in [*found.notes, *counts, *known]:
         console.say(f"detect: {note}")

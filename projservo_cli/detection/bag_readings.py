@@ -9,13 +9,11 @@ from scipy.spatial.transform import Rotation
 
 from projservo_cli.detection.stops import Stream, poses_at
 from projservo_cli.geometry.displacements import rigid_inverse
-from projservo_cli.geometry.flange import FlangeChart
+from projservo_cli.geometry.flange import UNIT, FlangeChart
 from projservo_cli.records import FloatArray, InputError, IntArray
 
 JOINTS, POSE = "sensor_msgs/msg/JointState", "geometry_msgs/msg/PoseStamped"
 TREES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")  # the second one of early ROS 1
-# Maximum difference of the length of a quaternion from one, as in a table of poses.
-_UNIT = 0.01
 # Minimum number of readings, for times between them and second differences.
 _LEAST = 3
 
@@ -49,7 +47,7 @@ class Readings:
     def _add(self, stamp: int, place: Any, turn: Any, parent: str, child: str) -> None:
         """Take a pose of a frame in its parent, unless it is none."""
         row = [place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w]
-        if np.isfinite(row).all() and abs(np.linalg.norm(row[3:]) - 1.0) <= _UNIT:
+        if np.isfinite(row).all() and abs(np.linalg.norm(row[3:]) - 1.0) <= UNIT:
             of_child = self._poses[child.lstrip("/")]
             of_child.setdefault(parent.lstrip("/"), []).append((stamp, row))
         else:

@@ -213,10 +213,7 @@ class BagCamera(NamedTuple):
 def _cameras(
     infos: Mapping[str, tuple[str, set[tuple[Any, ...]]]], images: Sequence[BagImage], notes: list[str]
 ) -> dict[str, BagCamera]:
-    """Cameras by name, with notes on those of which nothing is taken.
-
-    infos : topic of CameraInfo and distinct contents, by the names of cameras; images : one of each.
-    """
+    """Cameras by name, by topics and contents of CameraInfo, and an image of each; notes on others."""
     found = {}
     for (name, (topic, contents)), image in zip(infos.items(), images, strict=True):
         if not contents:  # as most bags have none
@@ -241,8 +238,7 @@ def _cameras(
 
 def _content(info: Any) -> tuple[Any, ...]:
     """Size, model, coefficients, K and P of a CameraInfo, whose matrices ROS 1 writes in capitals."""
-    matrices = (getattr(info, name, None) for name in "DKP")
-    D, K, P = (getattr(info, n) if M is None else M for n, M in zip("dkp", matrices, strict=True))
+    D, K, P = (getattr(info, name if hasattr(info, "K") else name.lower()) for name in "DKP")
     numbers = (tuple(map(float, M)) for M in (D, K, P))
     return int(info.width), int(info.height), str(info.distortion_model), *numbers
 

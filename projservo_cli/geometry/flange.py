@@ -17,6 +17,8 @@ from projservo_cli.records import FARTHEST_M, FloatArray, InputError, prismatic_
 
 # Types of the coordinates of a pose.
 FLANGE_TYPES = "PPPRRR"
+UNIT = 0.01
+"""Maximum difference of the length of a quaternion from one."""
 # Singular value of the rates of turns below which the middle one is taken to be 90°.
 _LOCKED = 1e-6
 # Maximum difference of RᵀR from the identity.

@@ -11,7 +11,7 @@ from projservo_cli.calibration.joint_model import describe_curve
 from projservo_cli.findings import REFUSES, Finding, from_text, named, of_readings
 from projservo_cli.messages import sentence, sentence_and_remedy, setup_of
 from projservo_cli.planning.motion_margins import CONSTRAINTS, OF_MOTION
-from projservo_cli.records import WHY_LOST, Calibration, CarriedByObject, Trace, scalars_of
+from projservo_cli.records import WHY_LOST, Calibration, CarriedByObject, StatedBoard, Trace, scalars_of
 from projservo_cli.report.figure_inputs import PAGE_FILE
 from projservo_cli.store.run_file import Run
 
@@ -141,8 +141,13 @@ def _calibration(run: Run, names: Sequence[str | None]) -> dict[str, Any]:
         () if calibration.refits is None else calibration.refits.refit_numbers.tolist(),
         strict=True,
     )
+    boards = () if calibration.boards is None else map(StatedBoard.of, calibration.boards.tolist())
+    used = [(f"{one.columns}x{one.rows}", one.first) for one in boards]
+    refuted = [one.subject for one in calibration.findings if one.code in ("unused_shape", "unplaced_board")]
     order, unshown = calibration.undecided_order, calibration.unshown
     values |= {
+        "boards": [{"board": name, "first": first, "used": True} for name, first in used]
+        + [{"board": one.name, "first": one.markers[0], "used": False} for one in refuted],
         "order_determined": None if order is None else not order.size,
         "model_errors": [_in_words(error, calibration) for error in calibration.model_errors],
         "unshown": None if unshown is None else _in_words(unshown, calibration),

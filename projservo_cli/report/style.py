@@ -216,6 +216,8 @@ def legend_below(figure: "Figure", columns: int, more: Iterable[LineStyle] = ())
                 points = np.asarray(handle.get_xydata() if isinstance(handle, Line2D) else [])
                 if not points.size or np.isfinite(points).any():  # else nothing of it is drawn
                     handles.setdefault(label, handle)
+    by_joint = sorted(name for name in handles if name.startswith("$q_"))  # whatever panels these are in
+    handles |= {name: handles.pop(name) for name in sorted(by_joint, key=len)}
     for extra in more:
         handles[extra["label"]] = Patch(**extra) if "facecolor" in extra else Line2D([], [], **extra)
     for ncols in range(columns, 0, -1):

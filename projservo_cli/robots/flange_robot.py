@@ -9,7 +9,7 @@ from typing import Any, TypeVar, cast
 import numpy as np
 
 from projservo_cli.geometry.flange import FlangeChart, require_poses
-from projservo_cli.records import FloatArray, InputError, WorkFailed
+from projservo_cli.records import FloatArray, InputError, WorkFailed, coordinate_names
 
 # Value of ``readings`` of a class that takes poses.
 _FLANGE = "flange"
@@ -27,6 +27,7 @@ class FlangeRobot:
 
     def __init__(self, robot: Any, chart: FlangeChart) -> None:
         self._robot, self._chart = robot, chart
+        self.coordinates = coordinate_names(chart.record)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._robot, name)

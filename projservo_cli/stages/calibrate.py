@@ -136,7 +136,7 @@ def estimate(
     seen: Observations, asked: Estimation, *, progress: Progress = silent
 ) -> tuple[Observation, Calibration, CrossValidation | None]:
     """Return the screened observations, the calibration, and its held-out errors on request."""
-    cameras = _cameras(seen, asked)
+    cameras = known_cameras(seen, asked)
     screening = screened(seen.record, seen.joint_types)
     board = BoardNumbering.by_joints(screening.observation, seen.joint_types)
     held_out: list[CrossValidation] = []
@@ -199,10 +199,12 @@ def estimate(
     return board.observation, with_findings(calibration, found), next(iter(held_out), None)
 
 
-def _cameras(seen: Observations, asked: Estimation) -> KnownCameras | None:
+def known_cameras(seen: Observations, asked: Estimation) -> KnownCameras | None:
     """Known cameras of all views; None without. Raises InputError for names or sizes that do not fit."""
     if not asked.intrinsics:
         return None
+    if asked.lens:
+        raise InputError("lenses are known and to be estimated (--intrinsics, --lens): leave one out")
     files = {name: file.path for name, file in asked.intrinsics}
     if {*files} == {ONLY} and len(seen.view) == 1:
         files = {seen.view[0]: files[ONLY]}

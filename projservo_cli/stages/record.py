@@ -28,6 +28,7 @@ from projservo_cli.records import (
     IntArray,
     JointList,
     Observation,
+    coordinate_names,
 )
 from projservo_cli.report.image_pages import annotated, recording_page
 from projservo_cli.robots.contract import PluginRobot, Reading, Robot, at_rest_after
@@ -462,7 +463,8 @@ class _Sight:
     @property
     def setup(self) -> Setup:
         """The cameras."""
-        return Setup(self.recording.mount, self.recording.view, self.recording.targets.shape[1])
+        names = coordinate_names(self.recording.flange_chart)
+        return Setup(self.recording.mount, self.recording.view, self.recording.targets.shape[1], names)
 
     def _faceless(self) -> Finding | None:
         """Tell which marker of the face no pose shows to two cameras yet; None if there is none.

@@ -64,9 +64,7 @@ def read_intrinsics(path: Path | str) -> Intrinsics:
     return Intrinsics(K, lens, size, off)
 
 
-def camera_info(
-    name: str, K: FloatArray, coefficients: FloatArray, size: tuple[int, int], model: str = "plumb_bob"
-) -> str:
+def camera_info(name: str, K: FloatArray, coefficients: FloatArray, model: str, size: tuple[int, int]) -> str:
     """File of a camera for ROS's camera_info_manager, as its calibration writes it."""
     rows = {
         "camera_matrix": K,

@@ -61,7 +61,7 @@ def camera_infos(found: OpenCV, size: ImageSize | None, names: Sequence[str]) ->
     K[:, 0, 1] = 0.0  # rounding errors
     for v, (name, (width, height)) in enumerate(zip(names, image_sizes(size, names), strict=True)):
         size_of = int(width), int(height)
-        files[f"{name}_info.yaml"] = camera_info(name, K[v], found.distortion[v], size_of)
+        files[f"{name}_info.yaml"] = camera_info(name, K[v], found.distortion[v], "plumb_bob", size_of)
     return files
 
 

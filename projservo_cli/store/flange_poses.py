@@ -11,15 +11,13 @@ from itertools import product
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from projservo_cli.geometry.flange import FlangeChart, require_poses
+from projservo_cli.geometry.flange import UNIT, FlangeChart, require_poses
 from projservo_cli.records import Calibration, FloatArray, InputError
 
 _METRES, _MILLIMETRES = ("x", "y", "z"), ("x_mm", "y_mm", "z_mm")
 _QUATERNION, _VECTOR = ("qx", "qy", "qz", "qw"), ("rx", "ry", "rz")
 _MATRIX = tuple(f"t{i}{j}" for i, j in product(range(1, 4), range(1, 5)))
 _FORMS = (*product((_METRES, _MILLIMETRES), (_QUATERNION, _VECTOR)), (_MATRIX, ()))
-# Maximum difference of the length of a quaternion from one.
-_UNIT = 0.01
 FORMS = "x, y, z (m) or x_mm, y_mm, z_mm with qx, qy, qz, qw or rx, ry, rz (rad); or T11 … T34 (m)"
 
 
@@ -58,7 +56,7 @@ def poses_of(columns: Sequence[str], values: FloatArray, where: Sequence[str]) -
 def _require_quaternions(turns: FloatArray, where: Sequence[str]) -> None:
     """Refuse quaternions (K, 4) that are not of unit length."""
     length = np.linalg.norm(turns, axis=1)
-    for k in np.flatnonzero(np.abs(length - 1.0) > _UNIT)[:1]:
+    for k in np.flatnonzero(np.abs(length - 1.0) > UNIT)[:1]:
         raise InputError(
             f"{where[k]}: the quaternion qx, qy, qz, qw has length {length[k]:.4g}, not 1: check its columns"
         )
@@ -67,7 +65,7 @@ def _require_quaternions(turns: FloatArray, where: Sequence[str]) -> None:
 def _require_vectors(turns: FloatArray, where: Sequence[str]) -> None:
     """Refuse rotation vectors (K, 3) that are longer than a turn."""
     angle = np.linalg.norm(turns, axis=1)
-    for k in np.flatnonzero(angle > 2.0 * math.pi + _UNIT)[:1]:
+    for k in np.flatnonzero(angle > 2.0 * math.pi + UNIT)[:1]:
         raise InputError(
             f"{where[k]}: the rotation vector rx, ry, rz has length {angle[k]:.4g} rad, more than a turn, as "
             "in degrees: multiply it by π/180, and give no Euler angles"

@@ -221,3 +221,4 @@ def test_files_that_do_not_fit_are_refused(projservo, monkeypatch, tmp_path, opt
     by_opencv("mine.yaml")
     answer = projservo("calibrate", *train, *options, "-o", "run")
     assert (answer.code, message in answer.err) == (2, True), answer.err
+    assert "making" not in answer.err  # before any work

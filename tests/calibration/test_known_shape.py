@@ -145,7 +145,7 @@ def test_of_several_boards_the_wrong_one_is_said_and_the_others_are_used():
     halves = StatedBoard(0, 8, 3), StatedBoard(24, 8, 3), StatedBoard(90, 8, 3)
     bent = lambda X: X * np.where(np.arange(48) < 24, 1.0, 1.01)[:, None] ** [1, 0, 0]  # noqa: E731
     found = by_flange(np.random.default_rng(0), shape=bent, boards=halves)
-    assert found.boards.tolist() == [[0.0, 8.0, 3.0, pytest.approx(np.nan, nan_ok=True)]]
+    assert found.boards.tolist() == [[0.0, 8.0, 3.0, pytest.approx(np.nan, nan_ok=True), 0.0]]
     said = [one for one in found.findings if one.code in ("unused_shape", "unplaced_board")]
     assert sorted((one.code, *one.subject.markers) for one in said) == [
         ("unplaced_board", 90),
@@ -186,7 +186,9 @@ def test_a_run_with_a_board_validates_refits_and_exports_metres(projservo, tmp_p
     types, observation = board_arms.recording("scara", rng, views=2)
     write_table(observation, "trials.csv")
     asked = "--joints", types, "--board", "chessboard:8x6:20mm", "--image-size", "1280x960", "-o", "run"
-    assert projservo("calibrate", "--data", "trials.csv", *asked).code == 0
+    answer = projservo("calibrate", "--data", "trials.csv", *asked, "--json")
+    assert answer.code == 0
+    assert answer.json["boards"] == [{"board": "8x6", "first": 0, "used": True}]
     for name, angle in (("same", 0.0), ("moved", 0.02)):
         write_table(board_arms.recording("scara", rng, 8, views=2, turned=angle)[1], f"{name}.csv")
         assert projservo("validate", "run", "--data", f"{name}.csv").code == int(name == "moved")

@@ -305,7 +305,7 @@ def test_camera_info_next_to_images_becomes_a_file_of_a_camera(projservo, storag
     rectified = topic.endswith("rect")
     np.testing.assert_array_equal(found.K, SMALLER[:, :3] if rectified else K8)
     assert (found.size, found.model) == ((8, 8), model)
-    Path("eye.yaml").write_text(camera_info("eye", *found[:2], found.size, found.model))
+    Path("eye.yaml").write_text(camera_info("eye", *found))
     read = read_intrinsics("eye.yaml")
     np.testing.assert_array_equal(read.K, found.K)
     assert (read.size, read.lens[3:].any()) == ((8, 8), not rectified)

@@ -71,3 +71,19 @@ def test_two_processes_draw_the_same_bytes_as_one_even_where_the_second_ends(mon
                 second._process.kill()
             assert list(second.contents(figures)) == alone
         assert len(here) == 3 if ended else 0 < len(here) < 3
+
+
+def test_joints_of_both_kinds_have_whole_ordinates_and_a_legend_in_their_order():
+    """Ticks of as many digits when the panels have their height as when labels are given room."""
+    decay = np.exp(-0.107 * np.arange(96))[:, None]
+    q = decay * [80.0, -140.0, 70.0, 15.0, -14.0, 130.0] + [-30.0, 60.0, -50.0, -5.0, 6.0, -70.0]
+    data = {"prismatic": np.array([True] * 3 + [False] * 3), "step_limit_deg": np.array(5.0)}
+    for name in ("free", "limited"):
+        data |= {f"t_s_{name}": 0.04 * np.arange(96), f"q_{name}": q, f"step_{name}": np.diff(q, axis=0)}
+    figure = style.drawn(SPECS["fig12_joints"].draw, data, SPECS["fig12_joints"].height)
+    with style.styled():
+        figure.canvas.draw()
+    renderer = figure.canvas.get_renderer()
+    assert min(axes.yaxis.label.get_window_extent(renderer).x0 for axes in figure.axes[:8]) > 2.0
+    names = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert names == [*(f"$q_{{{i}}}$" for i in range(1, 7)), "limit"]

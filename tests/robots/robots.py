@@ -54,9 +54,9 @@ class ByPoses(Sound):
 
     readings = "flange"
 
-    def __init__(self, config, lowest=0.0):
+    def __init__(self, config, lowest=0.0, blocked_at=0.0):
         super().__init__(config)
-        self.chart, self.lowest = load_config(config).robot.flange.chart, lowest
+        self.chart, self.lowest, self.blocked_at = load_config(config).robot.flange.chart, lowest, blocked_at
         self.q = np.zeros(6)
 
     def read(self):
@@ -69,6 +69,8 @@ class ByPoses(Sound):
         )
         if target[2, 3] < self.lowest:
             raise PoseRefused("joint 3 would pass its limit")
+        target = target.copy()
+        target[2, 3] = max(target[2, 3], self.blocked_at)  # by a table
         self.q, self.time = self.chart.coordinates(target[None])[0], due
 
     @property

@@ -86,6 +86,14 @@ def test_a_pose_that_the_controller_refuses_is_said_in_its_words(run):
     assert "joint 3 would pass its limit" in answer.err
 
 
+def test_a_coordinate_that_a_controller_does_not_reach_has_its_name(run):
+    """And not the number of a joint that the controller does not have."""
+    answer = run("record", "calibrate", blocked_at=0.34)
+    assert answer.code == 1
+    assert "z of the flange was sent to" in answer.err
+    assert "joint 3" not in answer.err
+
+
 def test_joints_and_poses_are_not_mistaken_for_each_other(projservo, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     ur5 = CARTESIAN.with_name("ur5.yaml")

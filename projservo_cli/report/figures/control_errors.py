@@ -200,6 +200,8 @@ def _draw_joints(data: Data, figure: "style.Figure") -> None:
     kinds = joint_kinds(prismatic)
     figure.set_figheight(1.2 + 3.6 * len(kinds))
     axes = figure.subplots(2 * len(kinds), 2, sharex=True, squeeze=False)
+    for panel in axes.flat:  # as many ticks as when labels are given room, however high it is then
+        panel.locator_params(axis="y", nbins=6)
     for (joints, steps), (chosen, unit) in zip(axes.reshape(-1, 2, 2), kinds, strict=True):
         for panel, panel_below, (name, limited) in zip(joints, steps, _WAYS, strict=True):
             t = data[f"t_s_{name}"]

@@ -9,6 +9,7 @@ from projservo_cli import messages, plugins
 from projservo_cli.detection.finders import finder_of
 from projservo_cli.findings import REFUSES, Finding, Subject
 from projservo_cli.hardware.camera_robot import Arm, CameraRobot
+from projservo_cli.messages.rows_by_code import Setup
 from projservo_cli.passwords import MASK
 from projservo_cli.records import FloatArray, InputError
 from projservo_cli.robots.contract import Bounds, PluginRobot, Reading, Robot
@@ -143,7 +144,8 @@ def path_to(
         of, others = Subject(joints=(i + 1,)), (found, *obstructions)
         short = Finding(code, REFUSES, of, gap[i], limit=q[i], unit=unit, others=others)
         again = "; then run the command again" + (" to continue" if what == "record" else "")
-        raise messages.failed([short], end=again, stage=what)
+        setup = Setup(coordinates=getattr(robot.robot.robot, "coordinates", ()))
+        raise messages.failed([short], setup, again, stage=what)
 
 
 def simulated_robot(driven: Drive, joints: Joints, robot: FaultyRobot) -> PluginRobot:
