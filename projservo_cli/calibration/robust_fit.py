@@ -231,7 +231,7 @@ class Solution:
         stated = problem.departure_derivative(params)
         if problem.by_pose:
             J = problem.whitened(params, problem.dense(problem.derivative(params), self.used), self.used)
-            J = np.vstack([J, np.pad(stated, ((0, 0), (0, J.shape[1] - s)))])
+            J = np.vstack([J, np.pad(stated, ((0, 0), (0, J.shape[1] - s)))]) if len(stated) else J
             factor = inverse_root(J, np.linalg.norm(J, axis=0), gauge)
             return Errors(factor[:s], own_place * factor[s:].reshape(m, 3, -1), np.zeros((m, 3, 3)))
         R = np.vstack([np.eye(s + offsets)[s:], np.pad(stated, ((0, 0), (0, offsets)))])

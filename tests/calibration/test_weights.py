@@ -96,6 +96,15 @@ def test_deviations_that_are_wrong_are_told_before_anything_is_accused(plenty, f
     assert "joint" not in str(refused.value)
 
 
+def test_deviations_that_a_rigid_body_refutes_are_told_by_one_camera(plenty):
+    robot, _, observation, _ = plenty
+    alone = dataclasses.replace(
+        observation, images=observation.images[:, :1], sigma=10.0 * observation.sigma[:, :1], view=("eye",)
+    )
+    with pytest.raises(WorkFailed, match=r"stated deviations .* wrong: a rigid body shows 0\.(09|1)"):
+        calibrate(alone, robot.joint_types, source="recorded")
+
+
 def test_the_factor_is_right_where_a_third_of_the_sightings_are_wrong(plenty):
     robot, _, observation, _ = plenty
     scales = []

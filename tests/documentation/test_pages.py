@@ -10,16 +10,19 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import projservo_cli
 from docs.generate.regions import GROUPS
 from projservo_cli import cli
 from projservo_cli.config import load_config
+from projservo_cli.geometry.displacements import rigid_inverse
 from projservo_cli.messages.rows_by_code import ROWS
 from projservo_cli.records import TOOL
 from projservo_cli.report import animation as film
 from projservo_cli.report.figures import FIGURES
 from projservo_cli.simulation.mjcf import mujoco
+from tests.calibration import flange
 from tests.calibration.flange import write_recording
 from tests.configured import draw_only, truth_of
 from tests.detection.lerobot import make_episodes, write_dataset
@@ -110,10 +113,17 @@ def put_hand(folder):
 
 
 def put_poses(folder):
-    """Two recordings by a camera on a flange, with its poses."""
+    """Two recordings by a camera on a flange, with its poses, and poses of a target that it sees."""
     rng = np.random.default_rng(2)
     write_recording(folder, TOOL, rng)
     write_recording(folder, TOOL, rng, ("new", "new_poses"), 8)
+    T = rigid_inverse(flange.poses(np.random.default_rng(2)) @ flange.HAND) @ flange.BOARD_ON_TABLE
+    T[:, :3, 3] += 3e-4 * rng.standard_normal((len(T), 3))
+    T[:, :3, :3] = Rotation.from_rotvec(1e-3 * rng.standard_normal((len(T), 3))).as_matrix() @ T[:, :3, :3]
+    m = T[:, :3, 3] @ flange.K.T
+    pose = np.flatnonzero((np.abs(m[:, :2] / m[:, 2:] - [640.0, 480.0]) < [540.0, 380.0]).all(axis=1))
+    rows = {"pose": pose, "target": 0 * pose, **flange.pose_columns(T[pose])}
+    (folder / "targets.csv").write_text(flange.to_csv(rows))
 
 
 def put_bag(folder):

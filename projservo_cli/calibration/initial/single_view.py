@@ -112,7 +112,7 @@ class RigidBody(ImageGeometry):
     marker: IntArray  # (m,) numbers of the markers in the fit
     dof: int
 
-    origin, shown = "body", "a rigid body shows"
+    origin, evidence = "body", "a rigid body shows"
 
     @classmethod
     def of(cls, detections: Detections, frame: ImageFrame) -> "RigidBody":
