@@ -80,7 +80,7 @@ class BoardSettings(Section):
     def contradictions(self) -> Iterator[Note]:
         """Tags of a board without."""
         for key in self.given("dictionary", "first") if self.kind != "charuco" else ():
-            yield (key,), f"is of the tags on a board of kind charuco, and {self.kind} has none"
+            yield (key,), f"is of the tags on a board of kind charuco, and one of kind {self.kind} has none"
 
 
 _Corners = Annotated[int, Strict(), Field(ge=LEAST_CORNERS, le=1000)]

@@ -310,7 +310,7 @@ def test_a_configured_board_is_found_in_frames_and_gives_a_length(rng):
 
 
 CONTRADICTED = {
-    "{kind: chessboard, rows: 7, columns: 9, dictionary: 4X4_50}": "a chessboard has none",
+    "{kind: chessboard, rows: 7, columns: 9, dictionary: 4X4_50}": "one of kind chessboard has none",
     "{kind: chessboard, rows: 7, columns: 9, first: 20}": "markers.board.first: is of the tags on a board",
     "{kind: chessboard, rows: 2, columns: 9}": "markers.board.rows: must be at least 3, not 2",
     "{kind: charuco, rows: 7, columns: 9}, tags: roof": "board is set as well, whose corners are the markers",
