@@ -34,7 +34,7 @@ def test_a_gear_is_named_and_stated_by_few_of_the_markers_too(monkeypatch, detec
 
 
 @pytest.mark.parametrize(
-    ("types", "views", "lens"), [("RRPR", 2, False), ("RRR", 4, False), ("RRR", 2, True)]
+    ("types", "views", "lens"), [("RRPR", 2, False), ("RRR", 3, False), ("RRR", 2, True)]
 )
 def test_a_search_with_some_of_the_markers_ends_where_that_with_all_does(monkeypatch, types, views, lens):
     """With wrong detections and markers that single views see; to a hundredth of the noise."""
