@@ -5,7 +5,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from projservo_cli.calibration import bundle_adjustment
@@ -178,7 +178,6 @@ def test_twin_of_the_kernels():
         assert np.abs(J[:, row] - kernel[:, 0]).max() < 1e-12 * np.abs(kernel).max() * 10
 
 
-@settings(max_examples=30)
 @given(st.integers(0, 10**6), st.floats(0.01, 3.0))
 def test_a_step_of_any_length_keeps_the_constraints(seed, length):
     rng = np.random.default_rng(seed)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from projservo_cli.control.law import OK
@@ -92,7 +92,6 @@ CHANGES = (
 
 
 @pytest.mark.parametrize("law", FACE_LAWS)
-@settings(max_examples=30)
 @given(
     st.sampled_from(["RRRRRR", "RRPRRR"]),
     st.integers(4, 6),

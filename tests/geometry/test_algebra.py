@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
@@ -56,7 +56,6 @@ def test_products_agree_with_numpy(rng):
     assert np.array_equal(x, y)
 
 
-@settings(max_examples=80)
 @given(vectors, vectors, vectors, vectors)
 def test_meet_is_the_determinant_with_one_row_open(a, b, c, x):
     """x·meet(a, b, c) = det[x; a; b; c]: incidence with all three, and the sign of an orientation."""
@@ -65,7 +64,6 @@ def test_meet_is_the_determinant_with_one_row_open(a, b, c, x):
     assert abs(dot(meet(a, b, c), x) - wanted) <= 32 * EPS * max(size, 1e-30)
 
 
-@settings(max_examples=120)
 @given(vectors, vectors, st.integers(-13, 0))
 def test_dual_pencil_is_orthonormal_and_incident(A, D, exponent):
     """Two orthonormal planes through A and A + D, also where D is thirteen orders smaller than A."""
@@ -85,7 +83,6 @@ def test_dual_pencil_is_orthonormal_and_incident(A, D, exponent):
         assert abs(a @ D) <= 1e-12 * sizes[1]
 
 
-@settings(max_examples=100)
 @given(st.sampled_from([0.0, 1e-9, 0.99e-4, 1.01e-4, 1e-2, 1.0, math.pi, 6.0]), st.integers(0, 10**6))
 def test_exponential_of_any_twist_is_that_of_scipy(size, seed):
     """Both branches at the switch from series to closed form; rotation and translation together."""
@@ -95,7 +92,6 @@ def test_exponential_of_any_twist_is_that_of_scipy(size, seed):
     assert as_array(twist_exponential(mat(X))) == pytest.approx(expm(X), abs=1e-13 * (1.0 + size * 5.0))
 
 
-@settings(max_examples=50)
 @given(st.integers(2, 6), st.integers(0, 10**6))
 def test_rotations_are_those_of_the_metric_that_all_joints_keep(joints, seed):
     """Of joints that turn about random directions, in a random affine frame; some keep none."""

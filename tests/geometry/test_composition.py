@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
@@ -15,7 +15,6 @@ from tests.samples import frame, revolute
 angles = st.one_of(st.sampled_from([0.0, math.pi]), st.floats(-2 * math.pi, 2 * math.pi))
 
 
-@settings(max_examples=100)
 @given(st.floats(-2, 2), st.floats(-2, 2), st.floats(-2, 2))
 def test_solutions_are_all_zeros_of_the_equation(p_0, p_s, p_c):
     amplitude = math.hypot(p_s, p_c)
@@ -52,7 +51,6 @@ def perpendicular_pair(seed):
     return tuple(G @ revolute(point, basis[i]) @ np.linalg.inv(G) for i in range(2))
 
 
-@settings(max_examples=100)
 @given(angles, angles, st.integers(0, 5))
 def test_one_rotation_equals_two(theta_r, theta_p, seed):
     """Also of exactly half a turn and beyond, where θ_s exceeds π or the axis changes sides."""

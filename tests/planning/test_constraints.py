@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
@@ -43,7 +43,6 @@ def test_signs_are_those_of_the_metric_truth(name):
     assert len(signs) > 3
 
 
-@settings(max_examples=60)
 @given(st.integers(3, 8), st.integers(0, 10_000))
 def test_width_is_the_least_over_all_directions(m, seed):
     points = np.random.default_rng(seed).uniform(0.0, 100.0, (m, 2))

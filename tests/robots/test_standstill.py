@@ -1,7 +1,7 @@
 """When a robot stands still, by readings of random joints and images in motion and at rest."""
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from projservo_cli.robots.contract import Reading
@@ -28,7 +28,6 @@ noises, image_noises = st.floats(1e-7, 1e-3), st.floats(1e-3, 0.5)
 
 
 @given(seeds, joints, noises, image_noises)
-@settings(max_examples=40, deadline=None)
 def test_noise_is_no_motion(seed, n, noise, image_noise):
     """Not before the time is over, and soon after it: a test at three deviations may fail now and then."""
     still, at_rest = Standstill(SECONDS), []
@@ -40,7 +39,6 @@ def test_noise_is_no_motion(seed, n, noise, image_noise):
 
 
 @given(seeds, joints, noises, image_noises, st.booleans())
-@settings(max_examples=40, deadline=None)
 def test_what_moves_out_of_the_noise_is_named(seed, n, noise, image_noise, joint_moves):
     """By ten deviations in the time, and more than counts as still."""
     speed = (10.0 * noise + 4e-4) / SECONDS * joint_moves

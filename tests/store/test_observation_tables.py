@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from projservo_cli.records import VIEWS, InputError, Observation
@@ -88,7 +88,6 @@ def test_a_list_of_joints_has_numbers_and_images_or_not(tmp_path):
 finite = st.floats(allow_nan=False, allow_infinity=False)
 
 
-@settings(max_examples=60)
 @given(st.data())
 def test_writing_and_reading_is_exact(tmp_path_factory, data):
     """Of one to four views, with or without deviations, times and poses in motion."""
