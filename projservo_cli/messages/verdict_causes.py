@@ -161,6 +161,16 @@ REASONS = {
         "{the_images} ({limit} at most)",
         "let it lie still, and plan again",
     ),
+    "covered_object": Row(
+        "the object {name}, markers {ends}, is covered in {the_images}: they show no motion of it, or "
+        "another than the others",
+        "keep the view of it free",
+    ),
+    "pushed_object": Row(
+        "the object {name}, markers {ends}, is {amount} from where its motion would have taken it ({limit} "
+        "at most)",
+        "look what pushed it, or raise its max_acceleration",
+    ),
     "unseen_markers": Row("{dark} of the calibration"),
 }
 

@@ -98,7 +98,7 @@ def markers_now(c: Calibration, carried: CarriedByObject) -> UncertainPoints:
     numbers, taught = carried.object_marker.tolist(), carried.s_object_taught
     assert taught is not None
     observed = [ObjectView(taught), ObjectView(carried.s_object, carried.sigma_object)]
-    return DisplacedObject.of(c, numbers, observed).markers_now(numbers)
+    return DisplacedObject.of(c, numbers, observed).markers(numbers)
 
 
 def _in_body(found: DisplacedObject, H: FloatArray, numbers: Sequence[int]) -> FloatArray:

@@ -364,7 +364,7 @@ class DisplacedObject:
     noise_factor: float  # residuals over their deviation, rms per degree of freedom
     unit_mm: float  # mm in a unit of the frame that it was found in; NaN without a known length
     left_out: tuple[int, ...]  # numbers of markers that were outliers in a frame, and left out of it
-    _rig: ObjectViewRig
+    rig: ObjectViewRig
     _fit: BundleFit
 
     @property
@@ -410,13 +410,13 @@ class DisplacedObject:
             noise_factor=float(np.sqrt(fit.cost / max(len(r) - J.shape[1], 1))),
             unit_mm=float(unit),
             left_out=left_out,
-            _rig=rig,
+            rig=rig,
             _fit=fit,
         )
 
-    def markers_now(self, numbers: Sequence[int]) -> UncertainPoints:
-        """Return some of its markers (k,) where they are now, NaN where unseen, in the frame of the looks."""
-        found = self._fit.points_at(len(self._fit.T) - 1, self._rig)
+    def markers(self, numbers: Sequence[int], look: int = -1) -> UncertainPoints:
+        """Return some of its markers (k,) at a look, NaN where unseen, in the frame of the looks."""
+        found = self._fit.points_at(range(len(self._fit.T))[look], self.rig)
         at = [self.marker.index(number) if number in self.marker else -1 for number in numbers]
         unseen = np.array(at) < 0
         return UncertainPoints(
@@ -430,7 +430,7 @@ class DisplacedObject:
             where unseen.
         Raises WorkFailed if they do not determine a pose of the tool, or the carried one is out of sight.
         """
-        rig, fit = self._rig, self._fit
+        rig, fit = self.rig, self._fit
         tool = _tool_at(rig, goal if isinstance(goal, ObjectView) else ObjectView(goal))
         to_taught = np.linalg.inv(fit.T[0])
         H = fit.T[-1] @ to_taught @ tool.T[0]
@@ -474,7 +474,7 @@ class DisplacedObject:
     def _errors(self) -> tuple[FloatArray, FloatArray]:
         """Errors of the displacement of the object (g, N) by its images, and (g, c) by the calibration."""
         fit = self._fit
-        by_images, by_calibration = fit.errors(self._rig, fit.X)
+        by_images, by_calibration = fit.errors(self.rig, fit.X)
         xi, xi_c = np.zeros((2, len(fit.bundle.E), 1))
         for at_frame, sign in ((0, -1.0), (len(fit.T) - 1, 1.0)):
             if at_frame != fit.bundle.fixed:
