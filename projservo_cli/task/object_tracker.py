@@ -16,7 +16,6 @@ from typing import NamedTuple, Self
 
 import numpy as np
 from scipy.linalg import eigh, expm
-from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
 from projservo_cli.findings import LIMITS, REFUSES, Finding, Subject
@@ -31,15 +30,18 @@ from projservo_cli.task.object_bundle_adjustment import ObjectView, ObjectViewRi
 _LASTS_S, _LEVER = 0.1, 4.0
 # Chances by which residuals of a view are of no motion; views disagree; a motion is not as predicted; its
 # acceleration is beyond its limit.
-_UNLIKE, _DISAGREE, _SUDDEN, _BEYOND = 1e-5, 1e-6, 1e-4, 1e-7
+_UNLIKE, _DISAGREE, _SUDDEN, _BEYOND = 1e-5, 1e-6, 1e-4, 1e-6
 # Chance by which a view that was left out still has to be alike to be used again.
 _ALIKE = 0.05
 # Motion of the images, rms px, by which a step is linearized again, and errors are; most steps.
 _LINEAR_PX, _ALIKE_WITHIN_PX, _STEPS = 2.0, 20.0, 6
 # Time over which errors are seen to change with the place, s.
 _AHEAD_S = 0.1
-# Frames by which the kind of a motion is told, and degree of it over time.
-_LAST, _DEGREE = 80, 3
+# Time over which what came of a sudden change is held against the largest acceleration, s.
+_JUDGED_S = 0.2
+# Frames by which the kind of a motion is told, its degree over time, terms of a logarithm, and the norm of
+# a displacement less the identity from which they do not do.
+_LAST, _DEGREE, _TERMS, _NEAR = 80, 3, 24, 0.6
 # Unknown displacements and rates at the start, radii and rad of the object, and per s.
 _WIDE = 10.0
 
@@ -83,10 +85,20 @@ class ObjectMotion(NamedTuple):
         return self._covariance[len(self.E) :, len(self.E) :]
 
 
+class _State(NamedTuple):
+    """State of the filter at a time."""
+
+    t: float  # s; -inf before any images
+    T: FloatArray  # (4, 4)
+    rates: FloatArray  # (g,) 1/s
+    P: FloatArray  # (2 g, 2 g) covariance of both
+
+
 class _Shared(NamedTuple):
-    """Errors that all frames share, at a displacement T (4, 4)."""
+    """Errors that all frames share, at a displacement (4, 4) and rates (g,)."""
 
     T: FloatArray
+    rates: FloatArray
     weight: FloatArray  # (V, k) of the views there
     by_motion: FloatArray  # (V, k, 2, g) derivatives of the images
     covariance: FloatArray  # (V, 2 k, 2 k) of the images of a view, px²
@@ -103,6 +115,11 @@ class _Seen(NamedTuple):
     unlike: FloatArray  # (V,) χ² of what no motion explains
     free: FloatArray  # (V,) degrees of freedom of it
     T: FloatArray  # (4, 4)
+
+    def off(self, used: BoolArray, P: FloatArray, *, shared: bool = False) -> float:
+        """χ² of views (V,) against a prediction of covariance (2 g, 2 g), without or with shared errors."""
+        N, b = (self.N_shared, self.b_shared) if shared else (self.N, self.b)
+        return _off(N[used].sum(axis=0), b[used].sum(axis=0), P)
 
     def disagreement(self, used: BoolArray) -> float:
         """χ² of views (V,) against a common motion, beyond a motion for each."""
@@ -138,16 +155,16 @@ class ObjectTracker:
         self._radius = float(np.sqrt(np.square(points.X[:, :3] - middle).sum(axis=1).mean()))
         self._size = np.r_[np.full(3, self._radius), np.ones(len(self._E) - 3)]
         T, g = rig.G @ found.D @ np.linalg.inv(rig.G), len(self._E)
-        self._T, self._rates, self._t = T, np.zeros(g), -math.inf
-        self._P = np.diag(np.square(_WIDE * np.tile(self._size, 2)))
+        wide = np.diag(np.square(_WIDE * np.tile(self._size, 2)))
+        self._state = _State(-math.inf, T, np.zeros(g), wide)
+        self._earlier, self._before = -math.inf, list[tuple[float, _State]]()
         weight = np.full((len(view), len(points.X)), 1.0 / rig.sigma_px)
-        self._shared = self._shared_at(T, weight)
-        per_unit = 1.0 / found.unit_mm
-        if math.isnan(per_unit):  # px
-            per_unit = 1.0 / float(np.sqrt(np.square(self._shared.by_motion[..., :3]).sum(axis=2).mean()))
+        self._shared = self._shared_at(self._state, weight)
+        self._px = float(np.sqrt(np.square(self._shared.by_motion[..., :3]).sum(axis=2).mean()))  # per unit
+        per_unit = 1.0 / (self._px if math.isnan(found.unit_mm) else found.unit_mm)
         lever = np.r_[np.ones(3), np.full(g - 3, 1.0 / (_LEVER * self._radius))]
         self._acceleration, self._most = acceleration * per_unit * lever, max_acceleration * per_unit * lever
-        self._captured, self._taken = np.full(len(view), -math.inf), deque([-math.inf] * 2, maxlen=2)
+        self._captured, self._shown = np.full(len(view), -math.inf), -math.inf
         self._used = self._left_out = np.zeros(len(view), dtype=bool)
         self._history: deque[tuple[float, int, FloatArray, FloatArray]] = deque(maxlen=_LAST)
         self.covered: Finding | None = None
@@ -186,78 +203,82 @@ class ObjectTracker:
         fresh = weight.any(axis=1)
         if not fresh.any():
             return
-        at = max(self._t, float(t[fresh].max()))
-        ago = np.where(fresh, at - t, 0.0)
-        T, P, dt = self._predicted(at)
-        self._refresh(T, weight)
-        images = (now.s, weight, ago)
-        seen = self._seen(T, self._rates, *images)
-        used = self._agreeing(seen, fresh, P)
+        state = self._predicted(self._state, max(self._state.t, float(t[fresh].max())))
+        self._refresh(state, weight)
+        images = (now.s, weight, np.where(fresh, state.t - t, 0.0))
+        seen = self._seen(state.T, state.rates, *images)
+        used = self._agreeing(seen, fresh, state.P)
         self._captured[fresh] = t[fresh]
         self._left_out = (self._left_out & ~fresh) | (fresh & ~used)
         self.covered = self._covered()
         if not used.any():
             return
-        if math.isfinite(dt) and _off(seen.N[used].sum(axis=0), seen.b[used].sum(axis=0), P) > chdtri(
-            len(self._E), _SUDDEN
-        ):
-            self._judge(seen, used, P, at)
-            P = P + self._sudden(dt)
-        self._update(T, P, seen, used, images)
-        self._t, self._used = at, used
+        if math.isfinite(dt := state.t - self._state.t):
+            if seen.off(used, state.P) > chdtri(len(self._E), _SUDDEN):
+                self._before = self._before or [(self._earlier, self._state)]
+                state = state._replace(P=state.P + self._sudden(dt))
+            self._judge(state.t, used, images)
+        self._earlier, self._state = self._state.t, self._updated(state, seen, used, images)
+        self._used = used
         if (weight[used] > 0.0).any(axis=0).sum() >= _least(self._rig):
-            self._taken.append(at)
+            self._shown = state.t
 
     def at(self, t: float) -> ObjectMotion:
         """Return the motion at a time, s, from the last images on by rates that stay."""
-        T, P, _ = self._predicted(t)
-        G, by_motion = self._rig.G, self._shared.by_motion
-        v = self._rates[:3]
+        state, G = self._predicted(self._state, t), self._rig.G
+        velocity = self._shared.by_motion @ state.rates
         return ObjectMotion(
             t=t,
-            D=np.linalg.solve(G, T) @ G,
+            D=np.linalg.solve(G, state.T) @ G,
             E=np.linalg.solve(G, self._E) @ G,
-            rates=self._rates.copy(),
-            by_images=P,
+            rates=state.rates,
+            by_images=state.P,
             by_calibration=self._shared.errors,
-            speed_mm_s=self._unit_mm * float(np.linalg.norm(T[:3, :3] @ v)),
-            speed_px_s=float(np.sqrt(np.square(by_motion @ self._rates).sum(axis=-1).mean())),
+            speed_mm_s=self._unit_mm * float(np.linalg.norm(state.T[:3, :3] @ state.rates[:3])),
+            speed_px_s=float(np.sqrt(np.square(velocity).sum(axis=-1).mean())),
         )
 
     def unseen_s(self, t: float) -> float:
         """Time since enough markers were seen last, s."""
-        return t - self._taken[-1]
+        return t - self._shown
 
     @property
     def kind(self) -> MotionKind:
         """Kind of the motion of the last frames, the likeliest by Schwarz's criterion."""
         most = max((views for _, views, _, _ in self._history), default=0)
-        frames = [one for one in self._history if one[1] == most]
+        back = np.linalg.inv(self._history[-1][2]) if most else np.eye(4)
+        frames = [
+            one
+            for one in self._history
+            if one[1] == most and np.linalg.norm(back @ one[2] - np.eye(4)) < _NEAR
+        ]
         if len(frames) < 2 * (_DEGREE + 1):
             return MotionKind("still", None)
         times, _, T, N = (np.array(part) for part in zip(*frames, strict=True))
-        G, middle = self._rig.G, T[len(T) // 2]
-        z = self._coordinates(np.asarray(np.linalg.solve(middle, T)))
-        ends = [self._shared_at(place, self._shared.weight).errors[: len(self._E)] for place in (T[0], T[-1])]
-        change = (ends[1] - ends[0]) * math.sqrt(len(T) / 12.0)
-        W = np.linalg.inv(np.linalg.inv(N.mean(axis=0)) + change @ change.T)
-        name, twist = _kind(times, z, np.asarray(W), self._E)
+        z = self._coordinates(back @ T)
+        first, last = (
+            self._shared_at(self._state._replace(T=end), self._shared.weight).errors[: len(self._E)]
+            for end in (T[0], T[-1])
+        )
+        change = (last - first) * math.sqrt(len(T) / 12.0)
+        weight = np.asarray(np.linalg.inv(np.linalg.inv(N.mean(axis=0)) + change @ change.T))
+        name, twist = _kind(times, z, weight, self._E)
         if twist is None:
             return MotionKind(name, None)
-        there = middle @ np.tensordot(twist, self._E, 1) @ np.linalg.inv(middle)
-        return MotionKind(name, np.linalg.solve(G, there) @ G)
+        to_frame = np.linalg.solve(self._rig.G, np.linalg.inv(back))
+        return MotionKind(name, to_frame @ np.tensordot(twist, self._E, 1) @ np.linalg.inv(to_frame))
 
-    def _predicted(self, t: float) -> tuple[FloatArray, FloatArray, float]:
-        """Displacement (4, 4) and covariance (2 g, 2 g) at a time, and the time since the last images."""
-        dt = t - self._t
+    def _predicted(self, state: _State, t: float) -> _State:
+        """State at a time, by rates that stay and accelerations by chance."""
+        dt, g = t - state.t, len(self._E)
         if not math.isfinite(dt):
-            return self._T, self._P, dt
-        g = len(self._E)
-        turned = np.eye(g) - dt * (by := self._rates @ self._brackets) + 0.5 * dt * dt * (by @ by)
+            return state._replace(t=t)
+        by = state.rates @ self._brackets
+        turned = np.eye(g) - dt * by + 0.5 * dt * dt * (by @ by)
         F = np.block([[turned, dt * np.eye(g) - 0.5 * dt * dt * by], [np.zeros((g, g)), np.eye(g)]])
         share = np.array([[abs(dt) ** 3 / 3.0, dt * dt / 2.0], [dt * dt / 2.0, abs(dt)]])
         noise = np.kron(share, np.diag(self._acceleration**2 * _LASTS_S))
-        return self._stepped(self._T, dt * self._rates), F @ self._P @ F.T + noise, dt
+        return _State(t, self._stepped(state.T, dt * state.rates), state.rates, F @ state.P @ F.T + noise)
 
     def _sudden(self, dt: float) -> FloatArray:
         """Covariance (2 g, 2 g) that the largest acceleration adds in a time, s."""
@@ -308,9 +329,7 @@ class ObjectTracker:
             def without(view: int) -> float:
                 """χ² of the other views, against each other and as predicted."""
                 rest = used & (np.arange(len(used)) != view)
-                return seen.disagreement(rest) + _off(
-                    seen.N_shared[rest].sum(axis=0), seen.b_shared[rest].sum(axis=0), P
-                )
+                return seen.disagreement(rest) + seen.off(rest, P, shared=True)
 
             used[min(np.flatnonzero(used).tolist(), key=without)] = False
         return used
@@ -321,65 +340,65 @@ class ObjectTracker:
         of = Subject(views=views, markers=self._of.markers, name=self._of.name)
         return Finding("covered_object", LIMITS, of) if views else None
 
-    def _judge(self, seen: _Seen, used: BoolArray, P: FloatArray, at: float) -> None:
-        """Hold a sudden motion, by two views or more that saw it before, against the largest acceleration."""
-        if used.sum() < 2 or not np.array_equal(used, self._used) or not math.isfinite(self._taken[0]):
+    def _judge(self, t: float, used: BoolArray, images: tuple[FloatArray, FloatArray, FloatArray]) -> None:
+        """Hold what came of a sudden change against the largest acceleration, from before it on.
+
+        By the same views all the while, two or more.
+        """
+        if not self._before:
             return
-        g = len(self._E)
-        N, b = seen.N_shared[used].sum(axis=0), seen.b_shared[used].sum(axis=0)
-        xi = np.linalg.lstsq(N, b)[0]
-        scale = self._most[:3].mean() / self._most
-        off = max(float(np.linalg.norm(part)) for part in np.split(scale * xi, [3]))
-        most = 0.5 * float(self._most[0]) * (at - self._taken[0]) ** 2
-        if off > most and (1.0 - most / off) ** 2 * _off(N, b, P) > chdtri(g, _BEYOND):
+        since, before = self._before[0]  # it may have begun with the frame before
+        if t - before.t > _JUDGED_S or used.sum() < 2 or not np.array_equal(used, self._used):
+            self._before.clear()
+            return
+        state = self._predicted(before, t)
+        seen = self._seen(state.T, state.rates, *images)
+        xi = np.linalg.lstsq(seen.N_shared[used].sum(axis=0), seen.b_shared[used].sum(axis=0))[0]
+        off = max(float(np.linalg.norm(part)) for part in np.split(xi * self._most[0] / self._most, [3]))
+        most = 0.5 * float(self._most[0]) * (t - since) ** 2
+        share = max(1.0 - most / max(off, 1e-300), 0.0)
+        if share**2 * seen.off(used, state.P, shared=True) > chdtri(len(xi), _BEYOND):
             known = not math.isnan(self._unit_mm)
-            px = float(np.sqrt(np.square(self._shared.by_motion[..., :3]).sum(axis=2).mean()))
-            per, unit = (self._unit_mm / MM, "m") if known else (px, "px")
+            per, unit = (self._unit_mm / MM, "m") if known else (self._px, "px")
             self.pushed = self.pushed or Finding(
                 "pushed_object", REFUSES, self._of, per * off, limit=per * most, unit=unit
             )
 
-    def _update(
-        self,
-        T: FloatArray,
-        P: FloatArray,
-        seen: _Seen,
-        used: BoolArray,
-        images: tuple[FloatArray, FloatArray, FloatArray],
-    ) -> None:
-        """Take images of some views (V,) at a displacement (4, 4), linearized again where a step is large."""
-        g, ago = len(self._E), images[2]
-        before, step = self._rates, np.zeros(2 * g)
+    def _updated(
+        self, state: _State, seen: _Seen, used: BoolArray, images: tuple[FloatArray, FloatArray, FloatArray]
+    ) -> _State:
+        """State with the images of some views (V,), linearized again where a step is large."""
+        g, step = len(self._E), np.zeros(2 * len(self._E))
+        by = [np.hstack([np.eye(g), -ago * np.eye(g)]) for ago in images[2][used]]
         for _ in range(_STEPS):
-            by = [np.hstack([np.eye(g), -ago[v] * np.eye(g)]) for v in np.flatnonzero(used)]
             N = sum(M.T @ one @ M for M, one in zip(by, seen.N[used], strict=True))
             b = sum(M.T @ one for M, one in zip(by, seen.b[used], strict=True))
-            gain = P @ np.linalg.inv(np.eye(2 * g) + N @ P)
+            gain = state.P @ np.linalg.inv(np.eye(2 * g) + N @ state.P)
             last, step = step, gain @ (b + N @ step)
-            there = self._stepped(T, step[:g])
-            rates = before + step[g:]
+            there, rates = self._stepped(state.T, step[:g]), state.rates + step[g:]
             moved = self._shared.by_motion @ (step - last)[:g]
             if np.sqrt(np.square(moved).sum(axis=-1).mean()) < _LINEAR_PX:
                 break
             seen = self._seen(there, rates, *images)
-        self._T, self._rates, self._P = there, rates, 0.5 * (gain + gain.T)
-        N_all = seen.N[used].sum(axis=0)
-        if np.linalg.matrix_rank(N_all, hermitian=True) == g:
-            measured = self._stepped(seen.T, np.linalg.solve(N_all, seen.b[used].sum(axis=0)))
-            self._history.append((self._t, int(used.sum()), measured, N_all))
+        every = seen.N[used].sum(axis=0)
+        measured = self._stepped(seen.T, np.linalg.lstsq(every, seen.b[used].sum(axis=0))[0])
+        self._history.append((state.t, int(used.sum()), measured, every))
+        return _State(state.t, there, rates, 0.5 * (gain + gain.T))
 
-    def _refresh(self, T: FloatArray, weight: FloatArray) -> None:
-        """Find the errors that frames share anew, where the object is elsewhere or seen by other views."""
+    def _refresh(self, state: _State, weight: FloatArray) -> None:
+        """Find the errors that frames share anew, where it is elsewhere, faster, or seen by other views."""
         last = self._shared
-        xi = self._coordinates(np.asarray(np.linalg.solve(last.T, T))[None])[0]
-        moved = np.sqrt(np.square(last.by_motion @ xi).sum(axis=-1).mean())
-        if moved > _ALIKE_WITHIN_PX or not np.array_equal(last.weight > 0.0, weight > 0.0):
-            self._shared = self._shared_at(T, weight)
+        moved = np.sqrt(np.square(self._X @ (state.T - last.T).T).sum(axis=1).mean())
+        faster = _AHEAD_S * np.linalg.norm((state.rates - last.rates) * self._size)
+        if max(moved, faster) * self._px > _ALIKE_WITHIN_PX or not np.array_equal(
+            last.weight > 0.0, weight > 0.0
+        ):
+            self._shared = self._shared_at(state, weight)
 
-    def _shared_at(self, T: FloatArray, weight: FloatArray) -> _Shared:
-        """Errors at a displacement (4, 4) that all frames share, of views of a weight (V, k)."""
+    def _shared_at(self, state: _State, weight: FloatArray) -> _Shared:
+        """Errors at a state that all frames share, of views of a weight (V, k)."""
         g, shape = len(self._E), (*weight.shape, 2)
-        places = np.stack([T, self._stepped(T, _AHEAD_S * self._rates)])
+        places = np.stack([state.T, self._stepped(state.T, _AHEAD_S * state.rates)])
         points = self._X @ places.swapaxes(1, 2)
         pixels = changes_of(self._rig.pixels(points.reshape(-1, 4)))
         pixels = np.moveaxis(pixels.reshape(-1, shape[0], 2, *shape[1:]), (0, 2), (4, 0))
@@ -395,30 +414,19 @@ class ObjectTracker:
         for J, by in zip(A, K, strict=True):
             inverse = np.linalg.pinv(root * J.reshape(-1, g), rcond=1e-9)
             errors.append(-inverse @ (root * by.reshape(len(root), -1)))
-        rate = (errors[1] - errors[0]) / _AHEAD_S + (self._rates @ self._brackets) @ errors[0]
+        rate = (errors[1] - errors[0]) / _AHEAD_S + (state.rates @ self._brackets) @ errors[0]
         flat = K[0].reshape(shape[0], -1, K.shape[-1])
-        return _Shared(T, weight, A[0], flat @ flat.swapaxes(1, 2), np.concatenate([errors[0], rate]))
+        return _Shared(
+            state.T, state.rates, weight, A[0], flat @ flat.swapaxes(1, 2), np.concatenate([errors[0], rate])
+        )
 
     def _coordinates(self, T: FloatArray) -> FloatArray:
-        """Coordinates (L, g) of displacements (L, 4, 4): logarithms."""
-        if self._rig.rigid:
-            w = Rotation.from_matrix(T[:, :3, :3]).as_rotvec()
-            middle = self._X[:, :3].mean(axis=0)
-            return np.hstack([_straight(w, (T[:, :3, :3] @ middle + T[:, :3, 3]) - middle), w])
-        X = T - np.eye(4)
-        log = X - X @ X / 2.0 + X @ X @ X / 3.0 - X @ X @ X @ X / 4.0
+        """Coordinates (L, g) of displacements (L, 4, 4) near the identity, by the series of the logarithm."""
+        X, log = T - np.eye(4), np.zeros_like(T)
+        for n in range(_TERMS, 0, -1):
+            log = X @ (np.eye(4) / n - log)
         by = self._E.reshape(len(self._E), -1).T
         return np.asarray(np.linalg.lstsq(by, log.reshape(len(T), -1).T)[0].T)
-
-
-def _straight(w: FloatArray, t: FloatArray) -> FloatArray:
-    """Velocities (L, 3) that with rotation vectors (L, 3) take a point by (L, 3) within a unit of time."""
-    angle = np.linalg.norm(w, axis=1)[:, None]
-    small = angle < 1e-4
-    safe = np.where(small, 1.0, angle)
-    third = np.where(small, 1.0 / 12.0, (1.0 - 0.5 * safe / np.tan(0.5 * safe)) / safe**2)
-    turn = np.cross(w, t)
-    return np.asarray(t - 0.5 * turn + third * np.cross(w, turn))
 
 
 def _least(rig: ObjectViewRig) -> int:
@@ -450,64 +458,56 @@ def _off(N: FloatArray, b: FloatArray, P: FloatArray) -> float:
 
 
 def _kind(t: FloatArray, z: FloatArray, W: FloatArray, E: FloatArray) -> tuple[str, FloatArray | None]:
-    """Likeliest kind of motion, and its twist (g,) of unit length or angle.
+    """Likeliest kind of a motion, and its twist (g,) of unit length or angle.
 
     t : (n,) times; z : (n, g) coordinates, of weight W (g, g) each; E : (g, 4, 4) generators.
     """
     n, g = z.shape
-    basis = np.linalg.qr(np.vander((t - t.mean()) / max(np.ptp(t), 1e-9), _DEGREE + 1, increasing=True))[0]
-    Z = basis[:, 1:].T @ z
-    M = Z.T @ Z
-    L = np.linalg.cholesky(W)
-    free = float(np.trace(L.T @ M @ L))
-    along, directions = np.linalg.eigh(L.T @ M @ L)
-    screw = np.linalg.solve(L.T, directions[:, -1])
-    MW = W @ M @ W
-    straight, lines = eigh(MW[:3, :3], W[:3, :3])
-    belt = np.r_[lines[:, -1], np.zeros(g - 3)]
-    wald, axis = _turntable(screw, along[-1], W, E)
+    powers = np.vander((t - t.mean()) / np.ptp(t), _DEGREE + 1, increasing=True)
+    moments = np.linalg.qr(powers)[0][:, 1:].T @ z  # by the course over time, whatever the first place
+    M = W @ moments.T @ moments @ W
+    whole = float(np.trace(np.linalg.solve(W, M)))
+    (*_, along), screws = eigh(M, W)
+    (*_, straight), lines = eigh(M[:3, :3], W[:3, :3])
+    axis, missed = _about_an_axis(screws[:, -1], np.linalg.inv(W) / max(along, 1e-12), E)
     each = math.log(n * g)
-    turns = g - 2 if g == 6 else g - 4
+    turns = 4 if g == 6 else 8  # coordinates of a line, and of the metric across it
     costs = {
-        "still": free,
-        "belt": free - straight[-1] + each * (2 + _DEGREE),
-        "turntable": free - along[-1] + wald + each * (turns + _DEGREE),
+        "still": whole,
+        "belt": whole - straight + each * (2 + _DEGREE),
+        "turntable": whole - along + missed + each * (turns + _DEGREE),
         "free": each * g * _DEGREE,
     }
-    name = min(costs, key=lambda one: costs[one])
-    if name == "belt":
-        return name, belt / np.linalg.norm(belt)
-    return name, axis if name == "turntable" else None
+    name = min(costs, key=lambda kind: costs[kind])
+    if name not in ("belt", "turntable"):
+        return name, None
+    belt = np.r_[lines[:, -1], np.zeros(g - 3)]
+    twist = axis if name == "turntable" else belt / np.linalg.norm(belt)
+    return name, twist * np.sign(moments[0] @ W @ twist)
 
 
-def _turntable(screw: FloatArray, square: float, W: FloatArray, E: FloatArray) -> tuple[float, FloatArray]:
-    """χ² by which a twist (g,) is no rotation about an axis, and the nearest such twist, per rad.
-
-    Its linear part has no trace and no determinant, and it has a fixed point.
-    square : χ² of the motion along it.
-    """
+def _about_an_axis(screw: FloatArray, covariance: FloatArray, E: FloatArray) -> tuple[FloatArray, float]:
+    """Rotation (g,) about an axis, per rad, that is next to a screw (g,), and the χ² between both."""
 
     def misses(xi: FloatArray) -> FloatArray:
+        """Trace, determinant and translation along the axis, which a rotation does not have."""
         X = np.tensordot(xi, E, 1)
-        L = X[:3, :3]
-        angle = math.sqrt(abs(0.5 * np.trace(L @ L)))
-        null = np.linalg.svd(L)[0][:, 2]
-        pitch = null @ (X[:3, 3])
-        det = np.linalg.det(L) / max(angle, 1e-12) ** 2
-        return np.array([np.trace(L), det, pitch * np.sign(null @ [1, 2, 3])])
+        null = np.linalg.svd(X[:3, :3])[0][:, 2]
+        return np.array(
+            [np.trace(X[:3, :3]), np.linalg.det(X[:3, :3]), null @ X[:3, 3] * np.sign(null @ along)]
+        )
 
-    size = np.linalg.norm(screw)
-    total = 0.0
-    covariance = np.linalg.inv(W) / max(square, 1e-12)
-    covariance -= np.outer(screw, screw) / max(square, 1e-12)
-    axis = screw.copy()
-    for _ in range(3):
-        c = misses(axis)
-        step = 1e-6 * size * np.eye(len(axis))
-        J = np.array([(misses(axis + one) - misses(axis - one)) / (2e-6 * size) for one in step]).T
-        gain = covariance @ J.T @ np.linalg.pinv(J @ covariance @ J.T, rcond=1e-8)
-        axis = axis - gain @ c
+    along, step = np.linalg.svd(np.tensordot(screw, E, 1)[:3, :3])[0][:, 2], 1e-6 * np.linalg.norm(screw)
+    axis = screw
+    for _ in range(_STEPS):
+        J = np.array([misses(axis + one) - misses(axis - one) for one in step * np.eye(len(E))]).T / (
+            2.0 * step
+        )
+        size = np.maximum(np.sqrt(np.einsum("ij,jk,ik->i", J, covariance, J)), 1e-300)[:, None]
+        gain = covariance @ (J / size).T @ np.linalg.pinv((J / size) @ covariance @ (J / size).T, rcond=1e-6)
+        axis = screw - gain @ ((misses(axis) + J @ (screw - axis)) / size[:, 0])
     apart = axis - screw
-    total = float(apart @ W @ apart) * square
-    X = np.tensordot(axis, E, 1)
-    return total, axis / math.sqrt(max(-0.5 * np.trace(X[:3, :3] @ X[:3, :3]), 1e-300))
+    L = np.tensordot(axis, E, 1)[:3, :3]
+    return axis / math.sqrt(max(-0.5 * np.trace(L @ L), 1e-300)), float(
+        apart @ np.linalg.solve(covariance, apart)
+    )
