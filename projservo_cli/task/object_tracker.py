@@ -22,7 +22,7 @@ from projservo_cli.findings import LIMITS, REFUSES, Finding, Subject
 from projservo_cli.geometry.displacements import generators
 from projservo_cli.metric.frame import Metric, changes_of
 from projservo_cli.records import MM, BoolArray, Calibration, FloatArray
-from projservo_cli.task.displaced_object import ALIKE_PX, DisplacedObject
+from projservo_cli.task.displaced_object import ALIKE_PX, CarriedGoal, Displaced, DisplacedObject
 from projservo_cli.task.object_bundle_adjustment import ObjectView, ObjectViewRig
 
 # Time over which an acceleration lasts, s; radii of an object at which a point accelerates by its rotation
@@ -145,7 +145,8 @@ class ObjectTracker:
         name: str,
     ) -> None:
         points, rig = found.markers(found.marker, 0), found.rig
-        self._places = list(places)  # of its markers among those of the images
+        self.M = found.M  # (k, 4) its markers when taught, in the calibrated frame
+        self._found, self._places = found, list(places)  # of its markers among those of the images
         self._rig, self._view, self._unit_mm = rig, tuple(view), found.unit_mm
         self._of = Subject(markers=found.marker, name=name)
         self._X, self._X_by = points.X, (points.by_images, points.by_calibration)
@@ -237,6 +238,15 @@ class ObjectTracker:
             speed_mm_s=self._unit_mm * float(np.linalg.norm(state.T[:3, :3] @ state.rates[:3])),
             speed_px_s=float(np.sqrt(np.square(velocity).sum(axis=-1).mean())),
         )
+
+    def carry(self, goal: ObjectView | FloatArray, t: float) -> CarriedGoal:
+        """Return a goal of the tool, taught with the object, at a time, s; as ``DisplacedObject.carry``."""
+        state, g = self._predicted(self._state, t), len(self._E)
+        N, c = (by.shape[-1] for by in self._X_by)
+        by_shape, by_calibration, alike = np.split(self._shared.errors[:g], [N, N + c], axis=1)
+        values, vectors = np.linalg.eigh(state.P[:g, :g])
+        by_images = np.hstack([vectors * np.sqrt(np.maximum(values, 0.0)), by_shape, alike])
+        return self._found.carry(goal, Displaced(state.T, np.eye(4), self._E, by_images, by_calibration))
 
     def unseen_s(self, t: float) -> float:
         """Time since enough markers were seen last, s."""
