@@ -37,10 +37,11 @@ _ALIKE = 0.05
 _LINEAR_PX, _ALIKE_WITHIN_PX, _STEPS = 2.0, 20.0, 6
 # Time over which errors are seen to change with the place, s.
 _AHEAD_S = 0.1
-# Time over which what came of a sudden change is held against the largest acceleration, s.
-_JUDGED_S = 0.2
+# Time over which what came of a sudden change is held against the largest acceleration, s, and number of
+# frames of the same views by which the motion is known first.
+_JUDGED_S, _FIRST = 0.2, 10
 # Frames by which the kind of a motion is told, its degree over time, terms of a logarithm, and the norm of
-# a displacement less the identity from which they do not do.
+# a linear part less the identity from which they do not do.
 _LAST, _DEGREE, _TERMS, _NEAR = 80, 3, 24, 0.6
 # Unknown displacements and rates at the start, radii and rad of the object, and per s.
 _WIDE = 10.0
@@ -121,11 +122,12 @@ class _Seen(NamedTuple):
         N, b = (self.N_shared, self.b_shared) if shared else (self.N, self.b)
         return _off(N[used].sum(axis=0), b[used].sum(axis=0), P)
 
-    def disagreement(self, used: BoolArray) -> float:
-        """χ² of views (V,) against a common motion, beyond a motion for each."""
-        N, b = self.N_shared[used], self.b_shared[used]
+    def disagreement(self, used: BoolArray) -> tuple[float, int]:
+        """χ² of views (V,) against a common motion, beyond a motion for each, and its degrees of freedom."""
+        N, b, g = self.N_shared[used], self.b_shared[used], self.b.shape[1]
         each = sum(float(_explained(*one)) for one in zip(N, b, strict=True))
-        return each - _explained(N.sum(axis=0), b.sum(axis=0))
+        free = int(np.minimum(self.free[used] + g, g).sum()) - g
+        return each - _explained(N.sum(axis=0), b.sum(axis=0)), free
 
 
 class ObjectTracker:
@@ -158,6 +160,7 @@ class ObjectTracker:
         T, g = rig.G @ found.D @ np.linalg.inv(rig.G), len(self._E)
         wide = np.diag(np.square(_WIDE * np.tile(self._size, 2)))
         self._state = _State(-math.inf, T, np.zeros(g), wide)
+        self._alike = 0  # frames in a row by the same views
         self._earlier, self._before = -math.inf, list[tuple[float, _State]]()
         weight = np.full((len(view), len(points.X)), 1.0 / rig.sigma_px)
         self._shared = self._shared_at(self._state, weight)
@@ -216,10 +219,12 @@ class ObjectTracker:
             return
         if math.isfinite(dt := state.t - self._state.t):
             if seen.off(used, state.P) > chdtri(len(self._E), _SUDDEN):
-                self._before = self._before or [(self._earlier, self._state)]
+                if self._alike >= _FIRST:
+                    self._before = self._before or [(self._earlier, self._state)]
                 state = state._replace(P=state.P + self._sudden(dt))
             self._judge(state.t, used, images)
         self._earlier, self._state = self._state.t, self._updated(state, seen, used, images)
+        self._alike = self._alike + 1 if np.array_equal(used, self._used) else 0
         self._used = used
         if (weight[used] > 0.0).any(axis=0).sum() >= _least(self._rig):
             self._shown = state.t
@@ -260,7 +265,7 @@ class ObjectTracker:
         frames = [
             one
             for one in self._history
-            if one[1] == most and np.linalg.norm(back @ one[2] - np.eye(4)) < _NEAR
+            if one[1] == most and np.linalg.norm((back @ one[2] - np.eye(4))[:3, :3]) < _NEAR
         ]
         if len(frames) < 2 * (_DEGREE + 1):
             return MotionKind("still", None)
@@ -324,22 +329,21 @@ class ObjectTracker:
 
     def _agreeing(self, seen: _Seen, fresh: BoolArray, P: FloatArray) -> BoolArray:
         """Views (V,) that show a motion of the object, the same."""
-        g = len(self._E)
         chance = np.where(self._left_out, _ALIKE, _UNLIKE)
         used = fresh & ~(seen.unlike > chdtri(np.maximum(seen.free, 1), chance))
 
         def disagree() -> bool:
             """Whether views contradict each other."""
             chance = _ALIKE if (used & self._left_out).any() else _DISAGREE
-            several = bool(used.sum() > 1)
-            return several and seen.disagreement(used) > chdtri(g * (used.sum() - 1), chance)
+            square, free = seen.disagreement(used)
+            return free > 0 and square > float(chdtri(free, chance))
 
         while disagree():
 
             def without(view: int) -> float:
                 """χ² of the other views, against each other and as predicted."""
                 rest = used & (np.arange(len(used)) != view)
-                return seen.disagreement(rest) + seen.off(rest, P, shared=True)
+                return seen.disagreement(rest)[0] + seen.off(rest, P, shared=True)
 
             used[min(np.flatnonzero(used).tolist(), key=without)] = False
         return used
@@ -353,7 +357,7 @@ class ObjectTracker:
     def _judge(self, t: float, used: BoolArray, images: tuple[FloatArray, FloatArray, FloatArray]) -> None:
         """Hold what came of a sudden change against the largest acceleration, from before it on.
 
-        By the same views all the while, two or more.
+        By the same views all the while, two or more: errors that frames share drop out.
         """
         if not self._before:
             return
@@ -363,11 +367,11 @@ class ObjectTracker:
             return
         state = self._predicted(before, t)
         seen = self._seen(state.T, state.rates, *images)
-        xi = np.linalg.lstsq(seen.N_shared[used].sum(axis=0), seen.b_shared[used].sum(axis=0))[0]
+        xi = np.linalg.lstsq(seen.N[used].sum(axis=0), seen.b[used].sum(axis=0))[0]
         off = max(float(np.linalg.norm(part)) for part in np.split(xi * self._most[0] / self._most, [3]))
         most = 0.5 * float(self._most[0]) * (t - since) ** 2
         share = max(1.0 - most / max(off, 1e-300), 0.0)
-        if share**2 * seen.off(used, state.P, shared=True) > chdtri(len(xi), _BEYOND):
+        if share**2 * seen.off(used, state.P) > chdtri(len(xi), _BEYOND):
             known = not math.isnan(self._unit_mm)
             per, unit = (self._unit_mm / MM, "m") if known else (self._px, "px")
             self.pushed = self.pushed or Finding(
