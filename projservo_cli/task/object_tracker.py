@@ -6,7 +6,8 @@ white noise. Source: A. W. Long et al., "The banana distribution is Gaussian", R
 "Estimation with Applications to Tracking and Navigation", 2001, sections 6.2 and 11.
 
 Errors of the shape and of the calibration are the same in all frames. They do not average out, so they are
-no noise of the filter, but a part of what it states.
+no noise of the filter, but a part of what it states. What they leave of each image is learnt, so that views
+agree, and one alone shows the object where it did with the others.
 """
 
 import math
@@ -35,8 +36,9 @@ _UNLIKE, _DISAGREE, _SUDDEN, _BEYOND = 1e-5, 1e-6, 1e-4, 1e-6
 _ALIKE = 0.05
 # Motion of the images, rms px, by which a step is linearized again, and errors are; most steps.
 _LINEAR_PX, _ALIKE_WITHIN_PX, _STEPS = 2.0, 20.0, 6
-# Time over which errors are seen to change with the place, s.
-_AHEAD_S = 0.1
+# Time over which errors are seen to change with the place, s; frames by which their residuals are learnt, at
+# least, and at most.
+_AHEAD_S, _LEARNT, _MEMORY = 0.5, 10, 25
 # Time over which what came of a sudden change is held against the largest acceleration, s, and number of
 # frames of the same views by which the motion is known first.
 _JUDGED_S, _FIRST = 0.2, 10
@@ -103,7 +105,16 @@ class _Shared(NamedTuple):
     weight: FloatArray  # (V, k) of the views there
     by_motion: FloatArray  # (V, k, 2, g) derivatives of the images
     covariance: FloatArray  # (V, 2 k, 2 k) of the images of a view, px²
+    change: FloatArray  # (V, 2 k, 2 k) of how they change meanwhile, px²
     errors: FloatArray  # (2 g, c) of displacement and rates
+
+
+class _Images(NamedTuple):
+    """Images of views, less the residuals that were learnt."""
+
+    s: FloatArray  # (V, k, 2) px
+    weight: FloatArray  # (V, k) 1 over the deviation, px; 0 where unseen
+    ago: FloatArray  # (V,) time since, s
 
 
 class _Seen(NamedTuple):
@@ -116,11 +127,16 @@ class _Seen(NamedTuple):
     unlike: FloatArray  # (V,) χ² of what no motion explains
     free: FloatArray  # (V,) degrees of freedom of it
     T: FloatArray  # (4, 4)
+    r: FloatArray  # (V, 2 k) residuals over their deviation
+    A: FloatArray  # (V, 2 k, g) derivatives of the images by motions, so too
 
-    def off(self, used: BoolArray, P: FloatArray, *, shared: bool = False) -> float:
-        """χ² of views (V,) against a prediction of covariance (2 g, 2 g), without or with shared errors."""
-        N, b = (self.N_shared, self.b_shared) if shared else (self.N, self.b)
-        return _off(N[used].sum(axis=0), b[used].sum(axis=0), P)
+    def by_itself(self, used: BoolArray) -> FloatArray:
+        """Step (g,) to the motion that views (V,) show, whatever the prediction."""
+        return np.asarray(np.linalg.lstsq(self.N[used].sum(axis=0), self.b[used].sum(axis=0))[0])
+
+    def off(self, used: BoolArray, P: FloatArray) -> float:
+        """χ² of views (V,) against a prediction of covariance (2 g, 2 g)."""
+        return _off(self.N[used].sum(axis=0), self.b[used].sum(axis=0), P)
 
     def disagreement(self, used: BoolArray) -> tuple[float, int]:
         """χ² of views (V,) against a common motion, beyond a motion for each, and its degrees of freedom."""
@@ -163,6 +179,7 @@ class ObjectTracker:
         self._alike = 0  # frames in a row by the same views
         self._earlier, self._before = -math.inf, list[tuple[float, _State]]()
         weight = np.full((len(view), len(points.X)), 1.0 / rig.sigma_px)
+        self._learnt, self._count = np.zeros((*weight.shape, 2)), np.zeros(weight.shape, dtype=int)
         self._shared = self._shared_at(self._state, weight)
         self._px = float(np.sqrt(np.square(self._shared.by_motion[..., :3]).sum(axis=2).mean()))  # per unit
         per_unit = 1.0 / (self._px if math.isnan(found.unit_mm) else found.unit_mm)
@@ -209,9 +226,10 @@ class ObjectTracker:
             return
         state = self._predicted(self._state, max(self._state.t, float(t[fresh].max())))
         self._refresh(state, weight)
-        images = (now.s, weight, np.where(fresh, state.t - t, 0.0))
+        images = _Images(now.s - self._learnt, weight, np.where(fresh, state.t - t, 0.0))
         seen = self._seen(state.T, state.rates, *images)
-        used = self._agreeing(seen, fresh, state.P)
+        near = self._near(seen, fresh, state.rates, images)
+        used = self._agreeing(seen, near, fresh, state.P)
         self._captured[fresh] = t[fresh]
         self._left_out = (self._left_out & ~fresh) | (fresh & ~used)
         self.covered = self._covered()
@@ -319,23 +337,33 @@ class ObjectTracker:
         A = bundle.by_motion(by_point, self._X[None], places)[0, each, each].reshape(V, -1, g)
         r = r.reshape(V, V, -1)[each, each]
         root = np.repeat(weight, 2, axis=1)
-        R = root[:, :, None] * self._shared.covariance * root[:, None] + np.eye(root.shape[1])
+        new = np.repeat(self._count < _LEARNT, 2, axis=1)
+        error = np.where(new[:, :, None] & new[:, None], self._shared.covariance, self._shared.change)
+        R = root[:, :, None] * error * root[:, None] + np.eye(root.shape[1])
         both = np.concatenate([r[..., None], A], axis=2)
         whole, shared = both.swapaxes(1, 2) @ both, both.swapaxes(1, 2) @ np.linalg.solve(R, both)
         N, b = shared[:, 1:, 1:], shared[:, 1:, 0]
         unlike = [shared[v, 0, 0] - _explained(N[v], b[v]) for v in each]
         free = (root > 0.0).sum(axis=1) - g
-        return _Seen(whole[:, 1:, 1:], whole[:, 1:, 0], N, b, np.array(unlike), free, T)
+        return _Seen(whole[:, 1:, 1:], whole[:, 1:, 0], N, b, np.array(unlike), free, T, r, A)
 
-    def _agreeing(self, seen: _Seen, fresh: BoolArray, P: FloatArray) -> BoolArray:
-        """Views (V,) that show a motion of the object, the same."""
+    def _near(self, seen: _Seen, fresh: BoolArray, rates: FloatArray, images: _Images) -> _Seen:
+        """Views against the motion that they show together, if it is far from the prediction."""
+        xi = seen.by_itself(fresh)
+        moved = self._shared.by_motion @ xi
+        if np.sqrt(np.square(moved).sum(axis=-1).mean()) < _LINEAR_PX:
+            return seen
+        return self._seen(self._stepped(seen.T, xi), rates, *images)
+
+    def _agreeing(self, seen: _Seen, near: _Seen, fresh: BoolArray, P: FloatArray) -> BoolArray:
+        """Views (V,) that show a motion of the object, the same, linearized there."""
         chance = np.where(self._left_out, _ALIKE, _UNLIKE)
-        used = fresh & ~(seen.unlike > chdtri(np.maximum(seen.free, 1), chance))
+        used = fresh & ~(near.unlike > chdtri(np.maximum(near.free, 1), chance))
 
         def disagree() -> bool:
             """Whether views contradict each other."""
             chance = _ALIKE if (used & self._left_out).any() else _DISAGREE
-            square, free = seen.disagreement(used)
+            square, free = near.disagreement(used)
             return free > 0 and square > float(chdtri(free, chance))
 
         while disagree():
@@ -343,7 +371,7 @@ class ObjectTracker:
             def without(view: int) -> float:
                 """χ² of the other views, against each other and as predicted."""
                 rest = used & (np.arange(len(used)) != view)
-                return seen.disagreement(rest)[0] + seen.off(rest, P, shared=True)
+                return near.disagreement(rest)[0] + seen.off(rest, P)
 
             used[min(np.flatnonzero(used).tolist(), key=without)] = False
         return used
@@ -354,7 +382,7 @@ class ObjectTracker:
         of = Subject(views=views, markers=self._of.markers, name=self._of.name)
         return Finding("covered_object", LIMITS, of) if views else None
 
-    def _judge(self, t: float, used: BoolArray, images: tuple[FloatArray, FloatArray, FloatArray]) -> None:
+    def _judge(self, t: float, used: BoolArray, images: _Images) -> None:
         """Hold what came of a sudden change against the largest acceleration, from before it on.
 
         By the same views all the while, two or more: errors that frames share drop out.
@@ -367,7 +395,7 @@ class ObjectTracker:
             return
         state = self._predicted(before, t)
         seen = self._seen(state.T, state.rates, *images)
-        xi = np.linalg.lstsq(seen.N[used].sum(axis=0), seen.b[used].sum(axis=0))[0]
+        xi = seen.by_itself(used)
         off = max(float(np.linalg.norm(part)) for part in np.split(xi * self._most[0] / self._most, [3]))
         most = 0.5 * float(self._most[0]) * (t - since) ** 2
         share = max(1.0 - most / max(off, 1e-300), 0.0)
@@ -378,12 +406,10 @@ class ObjectTracker:
                 "pushed_object", REFUSES, self._of, per * off, limit=per * most, unit=unit
             )
 
-    def _updated(
-        self, state: _State, seen: _Seen, used: BoolArray, images: tuple[FloatArray, FloatArray, FloatArray]
-    ) -> _State:
+    def _updated(self, state: _State, seen: _Seen, used: BoolArray, images: _Images) -> _State:
         """State with the images of some views (V,), linearized again where a step is large."""
         g, step = len(self._E), np.zeros(2 * len(self._E))
-        by = [np.hstack([np.eye(g), -ago * np.eye(g)]) for ago in images[2][used]]
+        by = [np.hstack([np.eye(g), -ago * np.eye(g)]) for ago in images.ago[used]]
         for _ in range(_STEPS):
             N = sum(M.T @ one @ M for M, one in zip(by, seen.N[used], strict=True))
             b = sum(M.T @ one for M, one in zip(by, seen.b[used], strict=True))
@@ -394,14 +420,27 @@ class ObjectTracker:
             if np.sqrt(np.square(moved).sum(axis=-1).mean()) < _LINEAR_PX:
                 break
             seen = self._seen(there, rates, *images)
-        every = seen.N[used].sum(axis=0)
-        measured = self._stepped(seen.T, np.linalg.lstsq(every, seen.b[used].sum(axis=0))[0])
+        every, xi = seen.N[used].sum(axis=0), seen.by_itself(used)
+        measured = self._stepped(seen.T, xi)
+        if len(self._history) >= _FIRST:  # else views of other times seem to disagree
+            self._learn(seen.r - seen.A @ xi, used, images.weight)
         self._history.append((state.t, int(used.sum()), measured, every))
         return _State(state.t, there, rates, 0.5 * (gain + gain.T))
 
+    def _learn(self, left: FloatArray, used: BoolArray, weight: FloatArray) -> None:
+        """Learn what errors that frames share leave of images, from residuals (V, 2 k) of no motion.
+
+        What is learnt takes no part in a motion that the same views show.
+        """
+        shown = (weight > 0.0) & used[:, None]
+        self._count += shown
+        share = shown / np.clip(self._count, 1, _MEMORY) / np.where(shown, weight, 1.0)
+        self._learnt += share[..., None] * left.reshape(self._learnt.shape)
+
     def _refresh(self, state: _State, weight: FloatArray) -> None:
-        """Find the errors that frames share anew, where it is elsewhere, faster, or seen by other views."""
+        """Find the errors that frames share anew, where it is elsewhere or faster, or more is seen."""
         last = self._shared
+        weight = np.where(weight > 0.0, weight, np.where(self._count > 0, last.weight, 0.0))
         moved = np.sqrt(np.square(self._X @ (state.T - last.T).T).sum(axis=1).mean())
         faster = _AHEAD_S * np.linalg.norm((state.rates - last.rates) * self._size)
         if max(moved, faster) * self._px > _ALIKE_WITHIN_PX or not np.array_equal(
@@ -429,10 +468,11 @@ class ObjectTracker:
             inverse = np.linalg.pinv(root * J.reshape(-1, g), rcond=1e-9)
             errors.append(-inverse @ (root * by.reshape(len(root), -1)))
         rate = (errors[1] - errors[0]) / _AHEAD_S + (state.rates @ self._brackets) @ errors[0]
-        flat = K[0].reshape(shape[0], -1, K.shape[-1])
-        return _Shared(
-            state.T, state.rates, weight, A[0], flat @ flat.swapaxes(1, 2), np.concatenate([errors[0], rate])
-        )
+        flat, change = (part.reshape(shape[0], -1, K.shape[-1]) for part in (K[0], K[1] - K[0]))
+        covariance, change = (part @ part.swapaxes(1, 2) for part in (flat, change))
+        change = change + ALIKE_PX**2 * np.eye(change.shape[1])
+        both = np.concatenate([errors[0], rate])
+        return _Shared(state.T, state.rates, weight, A[0], covariance, change, both)
 
     def _coordinates(self, T: FloatArray) -> FloatArray:
         """Coordinates (L, g) of displacements (L, 4, 4) near the identity, by the series of the logarithm."""
