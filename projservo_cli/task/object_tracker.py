@@ -23,8 +23,8 @@ from projservo_cli.findings import LIMITS, REFUSES, Finding, Subject
 from projservo_cli.geometry.displacements import generators
 from projservo_cli.metric.frame import Metric, changes_of
 from projservo_cli.records import MM, BoolArray, Calibration, FloatArray
-from projservo_cli.task.displaced_object import ALIKE_PX, CarriedGoal, Displaced, DisplacedObject
-from projservo_cli.task.object_bundle_adjustment import ObjectView, ObjectViewRig
+from projservo_cli.task.displaced_object import ALIKE_PX, RIGID, CarriedGoal, Displaced, DisplacedObject
+from projservo_cli.task.object_bundle_adjustment import ObjectView
 
 # Time over which an acceleration lasts, s; radii of an object at which a point accelerates by its rotation
 # as the object does itself: what turns it is mostly wider than it.
@@ -221,14 +221,14 @@ class ObjectTracker:
         now = ObjectView(s[:, self._places], None if sigma is None else sigma[:, self._places])
         bundle = self._rig.bundle([now], self._E)
         weight = bundle.weight[0] * ((t > self._captured) & np.isfinite(t))[:, None]
-        fresh = weight.any(axis=1)
+        fresh = (weight > 0.0).sum(axis=1) >= (RIGID if self._rig.rigid else RIGID + 1)
         if not fresh.any():
             return
         state = self._predicted(self._state, max(self._state.t, float(t[fresh].max())))
         self._refresh(state, weight)
         images = _Images(now.s - self._learnt, weight, np.where(fresh, state.t - t, 0.0))
         seen = self._seen(state.T, state.rates, *images)
-        near = self._near(seen, fresh, state.rates, images)
+        near = self._near(seen, fresh, state, images)
         used = self._agreeing(seen, near, fresh, state.P)
         self._captured[fresh] = t[fresh]
         self._left_out = (self._left_out & ~fresh) | (fresh & ~used)
@@ -243,9 +243,7 @@ class ObjectTracker:
             self._judge(state.t, used, images)
         self._earlier, self._state = self._state.t, self._updated(state, seen, used, images)
         self._alike = self._alike + 1 if np.array_equal(used, self._used) else 0
-        self._used = used
-        if (weight[used] > 0.0).any(axis=0).sum() >= _least(self._rig):
-            self._shown = state.t
+        self._used, self._shown = used, state.t
 
     def at(self, t: float) -> ObjectMotion:
         """Return the motion at a time, s, from the last images on by rates that stay."""
@@ -325,9 +323,18 @@ class ObjectTracker:
         return np.asarray(T @ expm(np.tensordot(xi, self._E, 1)))
 
     def _seen(
-        self, T: FloatArray, rates: FloatArray, s: FloatArray, weight: FloatArray, ago: FloatArray
+        self,
+        T: FloatArray,
+        rates: FloatArray,
+        s: FloatArray,
+        weight: FloatArray,
+        ago: FloatArray,
+        uncertain: FloatArray | float = 0.0,
     ) -> _Seen:
-        """Views against a displacement (4, 4), each as long before it as they were taken."""
+        """Views against a displacement (4, 4) and rates, each as long before it as they were taken.
+
+        uncertain : (g,) deviation of the rates.
+        """
         V, g = len(s), len(self._E)
         bundle = self._rig.bundle([ObjectView(s)] * V, self._E)
         bundle = bundle._replace(weight=weight[None] * np.eye(V)[..., None])
@@ -339,7 +346,12 @@ class ObjectTracker:
         root = np.repeat(weight, 2, axis=1)
         new = np.repeat(self._count < _LEARNT, 2, axis=1)
         error = np.where(new[:, :, None] & new[:, None], self._shared.covariance, self._shared.change)
-        R = root[:, :, None] * error * root[:, None] + np.eye(root.shape[1])
+        slip = ago[:, None] * (A @ np.broadcast_to(uncertain, g))
+        R = (
+            root[:, :, None] * error * root[:, None]
+            + slip[:, :, None] * slip[:, None]
+            + np.eye(root.shape[1])
+        )
         both = np.concatenate([r[..., None], A], axis=2)
         whole, shared = both.swapaxes(1, 2) @ both, both.swapaxes(1, 2) @ np.linalg.solve(R, both)
         N, b = shared[:, 1:, 1:], shared[:, 1:, 0]
@@ -347,13 +359,18 @@ class ObjectTracker:
         free = (root > 0.0).sum(axis=1) - g
         return _Seen(whole[:, 1:, 1:], whole[:, 1:, 0], N, b, np.array(unlike), free, T, r, A)
 
-    def _near(self, seen: _Seen, fresh: BoolArray, rates: FloatArray, images: _Images) -> _Seen:
-        """Views against the motion that they show together, if it is far from the prediction."""
+    def _near(self, seen: _Seen, fresh: BoolArray, state: _State, images: _Images) -> _Seen:
+        """Views against the motion that they show together, if it is far from the prediction.
+
+        Its rates are those on the way there, as uncertain as large.
+        """
         xi = seen.by_itself(fresh)
         moved = self._shared.by_motion @ xi
         if np.sqrt(np.square(moved).sum(axis=-1).mean()) < _LINEAR_PX:
             return seen
-        return self._seen(self._stepped(seen.T, xi), rates, *images)
+        dt = state.t - self._state.t
+        change = xi / dt if dt > 0.0 else 0.0 * xi
+        return self._seen(self._stepped(seen.T, xi), state.rates + change, *images, change)
 
     def _agreeing(self, seen: _Seen, near: _Seen, fresh: BoolArray, P: FloatArray) -> BoolArray:
         """Views (V,) that show a motion of the object, the same, linearized there."""
@@ -481,11 +498,6 @@ class ObjectTracker:
             log = X @ (np.eye(4) / n - log)
         by = self._E.reshape(len(self._E), -1).T
         return np.asarray(np.linalg.lstsq(by, log.reshape(len(T), -1).T)[0].T)
-
-
-def _least(rig: ObjectViewRig) -> int:
-    """Number of markers that a displacement needs."""
-    return 3 if rig.rigid else 4
 
 
 def _brackets(E: FloatArray) -> FloatArray:
