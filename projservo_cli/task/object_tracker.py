@@ -13,10 +13,11 @@ agree, and one alone shows the object where it did with the others.
 import math
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple, Self
 
 import numpy as np
-from scipy.linalg import eigh, expm
+from scipy.linalg import expm
 from scipy.special import chdtri
 
 from projservo_cli.findings import LIMITS, REFUSES, Finding, Subject
@@ -24,6 +25,7 @@ from projservo_cli.geometry.displacements import generators
 from projservo_cli.metric.frame import Metric, changes_of
 from projservo_cli.records import MM, BoolArray, Calibration, FloatArray
 from projservo_cli.task.displaced_object import ALIKE_PX, RIGID, CarriedGoal, Displaced, DisplacedObject
+from projservo_cli.task.motion_kind import STILL, MotionKind
 from projservo_cli.task.object_bundle_adjustment import ObjectView
 
 # Time over which an acceleration lasts, s; radii of an object at which a point accelerates by its rotation
@@ -42,20 +44,10 @@ _AHEAD_S, _LEARNT, _MEMORY = 0.5, 10, 25
 # Time over which what came of a sudden change is held against the largest acceleration, s, and number of
 # frames of the same views by which the motion is known first.
 _JUDGED_S, _FIRST = 0.2, 10
-# Frames by which the kind of a motion is told, its degree over time, terms of a logarithm, and the norm of
-# a linear part less the identity from which they do not do.
-_LAST, _DEGREE, _TERMS, _NEAR = 80, 3, 24, 0.6
+# Frames by which the kind of a motion is told.
+_LAST = 80
 # Unknown displacements and rates at the start, radii and rad of the object, and per s.
 _WIDE = 10.0
-
-
-class MotionKind(NamedTuple):
-    """Kind of a motion."""
-
-    name: str  # still, belt (a direction), turntable (an axis), free
-    operator: (
-        FloatArray | None
-    )  # (4, 4) of its direction, per unit, or axis, per rad, in the calibrated frame
 
 
 class ObjectMotion(NamedTuple):
@@ -232,12 +224,13 @@ class ObjectTracker:
         used = self._agreeing(seen, near, fresh, state.P)
         self._captured[fresh] = t[fresh]
         self._left_out = (self._left_out & ~fresh) | (fresh & ~used)
-        self.covered = self._covered()
+        views = tuple(self._view[v] for v in np.flatnonzero(self._left_out))
+        self.covered = Finding("covered_object", LIMITS, replace(self._of, views=views)) if views else None
         if not used.any():
             return
         if math.isfinite(dt := state.t - self._state.t):
             if seen.off(used, state.P) > chdtri(len(self._E), _SUDDEN):
-                if self._alike >= _FIRST:
+                if self._alike >= _FIRST and math.isfinite(self._most[0]):
                     self._before = self._before or [(self._earlier, self._state)]
                 state = state._replace(P=state.P + self._sudden(dt))
             self._judge(state.t, used, images)
@@ -275,29 +268,15 @@ class ObjectTracker:
 
     @property
     def kind(self) -> MotionKind:
-        """Kind of the motion of the last frames, the likeliest by Schwarz's criterion."""
+        """Kind of the motion of the last frames that as many views showed as any."""
         most = max((views for _, views, _, _ in self._history), default=0)
-        back = np.linalg.inv(self._history[-1][2]) if most else np.eye(4)
-        frames = [
-            one
-            for one in self._history
-            if one[1] == most and np.linalg.norm((back @ one[2] - np.eye(4))[:3, :3]) < _NEAR
-        ]
-        if len(frames) < 2 * (_DEGREE + 1):
-            return MotionKind("still", None)
-        times, _, T, N = (np.array(part) for part in zip(*frames, strict=True))
-        z = self._coordinates(back @ T)
-        first, last = (
-            self._shared_at(self._state._replace(T=end), self._shared.weight).errors[: len(self._E)]
-            for end in (T[0], T[-1])
-        )
-        change = (last - first) * math.sqrt(len(T) / 12.0)
-        weight = np.asarray(np.linalg.inv(np.linalg.inv(N.mean(axis=0)) + change @ change.T))
-        name, twist = _kind(times, z, weight, self._E)
-        if twist is None:
-            return MotionKind(name, None)
-        to_frame = np.linalg.solve(self._rig.G, np.linalg.inv(back))
-        return MotionKind(name, to_frame @ np.tensordot(twist, self._E, 1) @ np.linalg.inv(to_frame))
+        frames = [one for one in self._history if one[1] == most]
+        if len(frames) < _FIRST:
+            return STILL
+        t, _, T, N = (np.array(part) for part in zip(*frames, strict=True))
+        ends = (self._shared_at(self._state._replace(T=end), self._shared.weight) for end in (T[0], T[-1]))
+        first, last = (shared.errors[: len(self._E)] for shared in ends)
+        return MotionKind.of(t, T, N.mean(axis=0), last - first, self._E).in_frame(self._rig.G)
 
     def _predicted(self, state: _State, t: float) -> _State:
         """State at a time, by rates that stay and accelerations by chance."""
@@ -393,12 +372,6 @@ class ObjectTracker:
             used[min(np.flatnonzero(used).tolist(), key=without)] = False
         return used
 
-    def _covered(self) -> Finding | None:
-        """The finding of views that were left out; None without any."""
-        views = tuple(self._view[v] for v in np.flatnonzero(self._left_out))
-        of = Subject(views=views, markers=self._of.markers, name=self._of.name)
-        return Finding("covered_object", LIMITS, of) if views else None
-
     def _judge(self, t: float, used: BoolArray, images: _Images) -> None:
         """Hold what came of a sudden change against the largest acceleration, from before it on.
 
@@ -491,14 +464,6 @@ class ObjectTracker:
         both = np.concatenate([errors[0], rate])
         return _Shared(state.T, state.rates, weight, A[0], covariance, change, both)
 
-    def _coordinates(self, T: FloatArray) -> FloatArray:
-        """Coordinates (L, g) of displacements (L, 4, 4) near the identity, by the series of the logarithm."""
-        X, log = T - np.eye(4), np.zeros_like(T)
-        for n in range(_TERMS, 0, -1):
-            log = X @ (np.eye(4) / n - log)
-        by = self._E.reshape(len(self._E), -1).T
-        return np.asarray(np.linalg.lstsq(by, log.reshape(len(T), -1).T)[0].T)
-
 
 def _brackets(E: FloatArray) -> FloatArray:
     """Brackets (g, g, g) of generators: [E_i, E_j] = Σ_k E_k c[i, k, j]."""
@@ -521,59 +486,3 @@ def _off(N: FloatArray, b: FloatArray, P: FloatArray) -> float:
     g = len(b)
     prior = P[:g, :g]
     return _explained(N, b) - float(b @ prior @ np.linalg.solve(np.eye(g) + N @ prior, b))
-
-
-def _kind(t: FloatArray, z: FloatArray, W: FloatArray, E: FloatArray) -> tuple[str, FloatArray | None]:
-    """Likeliest kind of a motion, and its twist (g,) of unit length or angle.
-
-    t : (n,) times; z : (n, g) coordinates, of weight W (g, g) each; E : (g, 4, 4) generators.
-    """
-    n, g = z.shape
-    powers = np.vander((t - t.mean()) / np.ptp(t), _DEGREE + 1, increasing=True)
-    moments = np.linalg.qr(powers)[0][:, 1:].T @ z  # by the course over time, whatever the first place
-    M = W @ moments.T @ moments @ W
-    whole = float(np.trace(np.linalg.solve(W, M)))
-    (*_, along), screws = eigh(M, W)
-    (*_, straight), lines = eigh(M[:3, :3], W[:3, :3])
-    axis, missed = _about_an_axis(screws[:, -1], np.linalg.inv(W) / max(along, 1e-12), E)
-    each = math.log(n * g)
-    turns = 4 if g == 6 else 8  # coordinates of a line, and of the metric across it
-    costs = {
-        "still": whole,
-        "belt": whole - straight + each * (2 + _DEGREE),
-        "turntable": whole - along + missed + each * (turns + _DEGREE),
-        "free": each * g * _DEGREE,
-    }
-    name = min(costs, key=lambda kind: costs[kind])
-    if name not in ("belt", "turntable"):
-        return name, None
-    belt = np.r_[lines[:, -1], np.zeros(g - 3)]
-    twist = axis if name == "turntable" else belt / np.linalg.norm(belt)
-    return name, twist * np.sign(moments[0] @ W @ twist)
-
-
-def _about_an_axis(screw: FloatArray, covariance: FloatArray, E: FloatArray) -> tuple[FloatArray, float]:
-    """Rotation (g,) about an axis, per rad, that is next to a screw (g,), and the χ² between both."""
-
-    def misses(xi: FloatArray) -> FloatArray:
-        """Trace, determinant and translation along the axis, which a rotation does not have."""
-        X = np.tensordot(xi, E, 1)
-        null = np.linalg.svd(X[:3, :3])[0][:, 2]
-        return np.array(
-            [np.trace(X[:3, :3]), np.linalg.det(X[:3, :3]), null @ X[:3, 3] * np.sign(null @ along)]
-        )
-
-    along, step = np.linalg.svd(np.tensordot(screw, E, 1)[:3, :3])[0][:, 2], 1e-6 * np.linalg.norm(screw)
-    axis = screw
-    for _ in range(_STEPS):
-        J = np.array([misses(axis + one) - misses(axis - one) for one in step * np.eye(len(E))]).T / (
-            2.0 * step
-        )
-        size = np.maximum(np.sqrt(np.einsum("ij,jk,ik->i", J, covariance, J)), 1e-300)[:, None]
-        gain = covariance @ (J / size).T @ np.linalg.pinv((J / size) @ covariance @ (J / size).T, rcond=1e-6)
-        axis = screw - gain @ ((misses(axis) + J @ (screw - axis)) / size[:, 0])
-    apart = axis - screw
-    L = np.tensordot(axis, E, 1)[:3, :3]
-    return axis / math.sqrt(max(-0.5 * np.trace(L @ L), 1e-300)), float(
-        apart @ np.linalg.solve(covariance, apart)
-    )
