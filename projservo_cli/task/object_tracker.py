@@ -110,12 +110,13 @@ class _Images(NamedTuple):
 
 
 class _Seen(NamedTuple):
-    """Views of one time against a displacement: normal equations (V, g, g), (V, g) and squares (V,)."""
+    """Views of one time against a displacement: normal equations (V, g, g), (V, g) and χ²."""
 
     N: FloatArray
     b: FloatArray  # by the noise of images
     N_shared: FloatArray
     b_shared: FloatArray  # with the errors that frames share
+    explained: FloatArray  # (V,) χ² of a motion of each
     unlike: FloatArray  # (V,) χ² of what no motion explains
     free: FloatArray  # (V,) degrees of freedom of it
     T: FloatArray  # (4, 4)
@@ -132,10 +133,10 @@ class _Seen(NamedTuple):
 
     def disagreement(self, used: BoolArray) -> tuple[float, int]:
         """χ² of views (V,) against a common motion, beyond a motion for each, and its degrees of freedom."""
-        N, b, g = self.N_shared[used], self.b_shared[used], self.b.shape[1]
-        each = sum(float(_explained(*one)) for one in zip(N, b, strict=True))
+        together = _explained(self.N_shared[used].sum(axis=0), self.b_shared[used].sum(axis=0))
+        g = self.b.shape[1]
         free = int(np.minimum(self.free[used] + g, g).sum()) - g
-        return each - _explained(N.sum(axis=0), b.sum(axis=0)), free
+        return float(self.explained[used].sum() - together), free
 
 
 class ObjectTracker:
@@ -166,8 +167,8 @@ class ObjectTracker:
         self._radius = float(np.sqrt(np.square(points.X[:, :3] - middle).sum(axis=1).mean()))
         self._size = np.r_[np.full(3, self._radius), np.ones(len(self._E) - 3)]
         T, g = rig.G @ found.D @ np.linalg.inv(rig.G), len(self._E)
-        wide = np.diag(np.square(_WIDE * np.tile(self._size, 2)))
-        self._state = _State(-math.inf, T, np.zeros(g), wide)
+        wide = _WIDE**2
+        self._state = _State(-math.inf, T, np.zeros(g), _by(wide, 0.0, wide, self._size**2))
         self._alike = 0  # frames in a row by the same views
         self._earlier, self._before = -math.inf, list[tuple[float, _State]]()
         weight = np.full((len(view), len(points.X)), 1.0 / rig.sigma_px)
@@ -285,17 +286,16 @@ class ObjectTracker:
             return state._replace(t=t)
         by = state.rates @ self._brackets
         turned = np.eye(g) - dt * by + 0.5 * dt * dt * (by @ by)
-        F = np.block([[turned, dt * np.eye(g) - 0.5 * dt * dt * by], [np.zeros((g, g)), np.eye(g)]])
-        share = np.array([[abs(dt) ** 3 / 3.0, dt * dt / 2.0], [dt * dt / 2.0, abs(dt)]])
-        noise = np.kron(share, np.diag(self._acceleration**2 * _LASTS_S))
+        F = np.eye(2 * g)
+        F[:g, :g], F[:g, g:] = turned, dt * np.eye(g) - 0.5 * dt * dt * by
+        noise = _by(abs(dt) ** 3 / 3.0, dt * dt / 2.0, abs(dt), self._acceleration**2 * _LASTS_S)
         return _State(t, self._stepped(state.T, dt * state.rates), state.rates, F @ state.P @ F.T + noise)
 
     def _sudden(self, dt: float) -> FloatArray:
         """Covariance (2 g, 2 g) that the largest acceleration adds in a time, s."""
         if not math.isfinite(self._most[0]):
-            return np.diag(np.square(np.tile(self._size, 2)) * np.repeat([1.0, _WIDE**2], len(self._E)))
-        share = np.array([[dt**4 / 4.0, dt**3 / 2.0], [dt**3 / 2.0, dt**2]])
-        return np.kron(share, np.diag(self._most**2))
+            return _by(1.0, 0.0, _WIDE**2, self._size**2)
+        return _by(dt**4 / 4.0, dt**3 / 2.0, dt**2, self._most**2)
 
     def _stepped(self, T: FloatArray, xi: FloatArray) -> FloatArray:
         """Displacement (4, 4) after a step (g,)."""
@@ -334,9 +334,9 @@ class ObjectTracker:
         both = np.concatenate([r[..., None], A], axis=2)
         whole, shared = both.swapaxes(1, 2) @ both, both.swapaxes(1, 2) @ np.linalg.solve(R, both)
         N, b = shared[:, 1:, 1:], shared[:, 1:, 0]
-        unlike = [shared[v, 0, 0] - _explained(N[v], b[v]) for v in each]
-        free = (root > 0.0).sum(axis=1) - g
-        return _Seen(whole[:, 1:, 1:], whole[:, 1:, 0], N, b, np.array(unlike), free, T, r, A)
+        explained, free = _explained(N, b), (root > 0.0).sum(axis=1) - g
+        unlike = shared[:, 0, 0] - explained
+        return _Seen(whole[:, 1:, 1:], whole[:, 1:, 0], N, b, explained, unlike, free, T, r, A)
 
     def _near(self, seen: _Seen, fresh: BoolArray, state: _State, images: _Images) -> _Seen:
         """Views against the motion that they show together, if it is far from the prediction.
@@ -465,6 +465,12 @@ class ObjectTracker:
         return _Shared(state.T, state.rates, weight, A[0], covariance, change, both)
 
 
+def _by(place: float, both: float, rate: float, share: FloatArray) -> FloatArray:
+    """Covariance (2 g, 2 g) of displacement and rates of a share (g,) of each coordinate."""
+    blocks = np.array([[place, both], [both, rate]])[:, None, :, None] * np.diag(share)[:, None]
+    return np.asarray(blocks.reshape(2 * len(share), -1))
+
+
 def _brackets(E: FloatArray) -> FloatArray:
     """Brackets (g, g, g) of generators: [E_i, E_j] = Σ_k E_k c[i, k, j]."""
     products = np.einsum("iab,jbc->ijac", E, E)
@@ -473,16 +479,16 @@ def _brackets(E: FloatArray) -> FloatArray:
     return np.asarray(found.reshape(len(E), len(E), len(E)).transpose(1, 0, 2))
 
 
-def _explained(N: FloatArray, b: FloatArray) -> float:
-    """χ² that a motion of normal equations (g, g), (g,) explains."""
+def _explained(N: FloatArray, b: FloatArray) -> FloatArray:
+    """χ² (…) that motions of normal equations (…, g, g), (…, g) explain."""
     values, vectors = np.linalg.eigh(N)
-    kept = values > 1e-10 * max(values[-1], 1e-300)
-    along = vectors[:, kept].T @ b
-    return float((along * along / values[kept]).sum())
+    along = (b[..., None, :] @ vectors)[..., 0, :]
+    kept = values > 1e-10 * np.maximum(values[..., -1:], 1e-300)
+    return np.asarray((along * along / np.where(kept, values, np.inf)).sum(axis=-1))
 
 
 def _off(N: FloatArray, b: FloatArray, P: FloatArray) -> float:
     """χ² of a motion of normal equations (g, g), (g,) against a prediction of covariance (2 g, 2 g)."""
     g = len(b)
     prior = P[:g, :g]
-    return _explained(N, b) - float(b @ prior @ np.linalg.solve(np.eye(g) + N @ prior, b))
+    return float(_explained(N, b) - b @ prior @ np.linalg.solve(np.eye(g) + N @ prior, b))
