@@ -169,7 +169,7 @@ class ObjectTracker:
         T, g = rig.G @ found.D @ np.linalg.inv(rig.G), len(self._E)
         wide = _WIDE**2
         self._state = _State(-math.inf, T, np.zeros(g), _by(wide, 0.0, wide, self._size**2))
-        self._alike = 0  # frames in a row by the same views
+        self._alike, self._scatters = 0, False  # frames in a row by the same views
         self._earlier, self._before = -math.inf, list[tuple[float, _State]]()
         weight = np.full((len(view), len(points.X)), 1.0 / rig.sigma_px)
         self._learnt, self._count = np.zeros((*weight.shape, 2)), np.zeros(weight.shape, dtype=int)
@@ -209,8 +209,10 @@ class ObjectTracker:
         """Take images of the views, each of its own time.
 
         t : (V,) capture times, s; a view whose time is not later than before shows nothing new.
-        s : (V, k, 2) px, NaN where unseen; sigma : (V, k) px, NaN or None as calibrated.
+        s : (V, k, 2) px, NaN where unseen.
+        sigma : (V, k) px; None, or NaN, is as calibrated, and then as residuals scatter.
         """
+        self._scatters = sigma is None or not np.isfinite(sigma).any()
         now = ObjectView(s[:, self._places], None if sigma is None else sigma[:, self._places])
         bundle = self._rig.bundle([now], self._E)
         weight = bundle.weight[0] * ((t > self._captured) & np.isfinite(t))[:, None]
@@ -242,7 +244,6 @@ class ObjectTracker:
     def at(self, t: float) -> ObjectMotion:
         """Return the motion at a time, s, from the last images on by rates that stay."""
         state, G = self._predicted(self._state, t), self._rig.G
-        velocity = self._shared.by_motion @ state.rates
         return ObjectMotion(
             t=t,
             D=np.linalg.solve(G, state.T) @ G,
@@ -251,7 +252,7 @@ class ObjectTracker:
             by_images=state.P,
             by_calibration=self._shared.errors,
             speed_mm_s=self._unit_mm * float(np.linalg.norm(state.T[:3, :3] @ state.rates[:3])),
-            speed_px_s=float(np.sqrt(np.square(velocity).sum(axis=-1).mean())),
+            speed_px_s=self._moved_px(state.rates),
         )
 
     def carry(self, goal: ObjectView | FloatArray, t: float) -> CarriedGoal:
@@ -343,13 +344,19 @@ class ObjectTracker:
 
         Its rates are those on the way there, as uncertain as large.
         """
-        xi = seen.by_itself(fresh)
-        moved = self._shared.by_motion @ xi
-        if np.sqrt(np.square(moved).sum(axis=-1).mean()) < _LINEAR_PX:
-            return seen
-        dt = state.t - self._state.t
-        change = xi / dt if dt > 0.0 else 0.0 * xi
-        return self._seen(self._stepped(seen.T, xi), state.rates + change, *images, change)
+        dt, total = state.t - self._state.t, np.zeros(len(self._E))
+        for _ in range(_STEPS):
+            xi = seen.by_itself(fresh)
+            if self._moved_px(xi) < _LINEAR_PX:
+                break
+            total = total + xi
+            change = total / dt if dt > 0.0 else 0.0 * xi
+            seen = self._seen(self._stepped(seen.T, xi), state.rates + change, *images, change)
+        return seen
+
+    def _moved_px(self, xi: FloatArray) -> float:
+        """Motion of the images of all markers by a step (g,), rms px."""
+        return float(np.sqrt(np.square(self._shared.by_motion @ xi).sum(axis=-1).mean()))
 
     def _agreeing(self, seen: _Seen, near: _Seen, fresh: BoolArray, P: FloatArray) -> BoolArray:
         """Views (V,) that show a motion of the object, the same, linearized there."""
@@ -406,8 +413,7 @@ class ObjectTracker:
             gain = state.P @ np.linalg.inv(np.eye(2 * g) + N @ state.P)
             last, step = step, gain @ (b + N @ step)
             there, rates = self._stepped(state.T, step[:g]), state.rates + step[g:]
-            moved = self._shared.by_motion @ (step - last)[:g]
-            if np.sqrt(np.square(moved).sum(axis=-1).mean()) < _LINEAR_PX:
+            if self._moved_px((step - last)[:g]) < _LINEAR_PX:
                 break
             seen = self._seen(there, rates, *images)
         every, xi = seen.N[used].sum(axis=0), seen.by_itself(used)
@@ -418,14 +424,18 @@ class ObjectTracker:
         return _State(state.t, there, rates, 0.5 * (gain + gain.T))
 
     def _learn(self, left: FloatArray, used: BoolArray, weight: FloatArray) -> None:
-        """Learn what errors that frames share leave of images, from residuals (V, 2 k) of no motion.
+        """Learn what errors that frames share leave of images, and their noise, from residuals (V, 2 k).
 
-        What is learnt takes no part in a motion that the same views show.
+        These are of no motion, so what is learnt takes no part in one that the same views show.
         """
         shown = (weight > 0.0) & used[:, None]
         self._count += shown
         share = shown / np.clip(self._count, 1, _MEMORY) / np.where(shown, weight, 1.0)
         self._learnt += share[..., None] * left.reshape(self._learnt.shape)
+        if self._scatters and (free := 2 * int(shown.sum()) - len(self._E)) > 0:
+            times = float(np.square(left[used]).sum()) / free
+            sigma = self._rig.sigma_px * math.sqrt(1.0 + (times - 1.0) / _MEMORY)
+            self._rig = self._rig._replace(sigma_px=max(sigma, ALIKE_PX))
 
     def _refresh(self, state: _State, weight: FloatArray) -> None:
         """Find the errors that frames share anew, where it is elsewhere or faster, or more is seen."""

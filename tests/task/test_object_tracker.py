@@ -182,6 +182,25 @@ def START_ONLY(t):
     return START
 
 
+def test_noise_is_as_residuals_scatter_where_none_is_given(arm, c):
+    """Errors are stated within 15 % of those with the true deviation, by 25 frames of 26 residuals."""
+    stated = []
+    for sigma in (None, np.full((2, 8), 0.1)):
+        tracker = tracker_of(arm, c, BELT)
+        followed(tracker, arm, BELT, 130, np.random.default_rng(5), std=0.1, sigma=sigma)
+        stated.append(np.sqrt(np.diag(tracker.at(5.2).by_images)))
+    assert stated[0] == pytest.approx(stated[1], rel=0.15)
+
+
+def test_it_is_found_where_it_went_after_the_last_look(arm, c, rng):
+    """By 150 mm and 40°, in the first frame."""
+    tracker = tracker_of(arm, c, BELT)
+    away = displacement([0.5, -0.4, 0.3], [0.1, 0.08, -0.08]) @ START
+    tracker.observe(np.zeros(2), noisy(pixels(arm.cameras, OBJECT @ away.T), rng))
+    assert tracker.covered is None
+    assert off_mm(arm, tracker.at(0.0), lambda t: away) < 5.0
+
+
 def covering(kind, rng, first=20, last=40):
     """Images in which a hand is over the first camera: corners hidden, drawn aside, all shifted or none."""
 
