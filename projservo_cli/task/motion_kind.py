@@ -15,6 +15,8 @@ from projservo_cli.records import FloatArray
 # Degree of a motion over time, terms of a logarithm, norm of a linear part less the identity from which they
 # do not do, and number of steps to an axis.
 _DEGREE, _TERMS, _NEAR, _STEPS = 3, 24, 0.6, 6
+# Deviation of trace, determinant or pitch of a rotation by 1 rad, below which it is rounding.
+_ROUNDING = 1e-8
 
 
 class MotionKind(NamedTuple):
@@ -76,7 +78,9 @@ def _coordinates(T: FloatArray, E: FloatArray) -> FloatArray:
 
 def _about_an_axis(screw: FloatArray, covariance: FloatArray, E: FloatArray) -> tuple[FloatArray, float]:
     """Rotation (g,) about an axis, per rad, that is next to a screw (g,), and the χ² between both."""
-    along = np.linalg.svd(np.tensordot(screw, E, 1)[:3, :3])[0][:, 2]
+    L = np.tensordot(screw, E, 1)[:3, :3]
+    along, angle = np.linalg.svd(L)[0][:, 2], math.sqrt(max(-0.5 * np.trace(L @ L), 1e-24))
+    screw, covariance = screw / angle, covariance / angle**2
 
     def misses(xi: FloatArray) -> FloatArray:
         """Trace, determinant and translation along the axis, which a rotation does not have."""
@@ -89,10 +93,11 @@ def _about_an_axis(screw: FloatArray, covariance: FloatArray, E: FloatArray) -> 
     for _ in range(_STEPS):
         J = np.array([misses(axis + one) - misses(axis - one) for one in step * np.eye(len(E))]).T
         J /= 2.0 * step
-        size = np.maximum(np.sqrt(np.einsum("ij,jk,ik->i", J, covariance, J)), 1e-300)[:, None]
+        # Rigid motions have neither trace nor determinant: their rows are rounding.
+        size = np.maximum(np.sqrt(np.einsum("ij,jk,ik->i", J, covariance, J)), _ROUNDING)[:, None]
         of_unit = J / size
         gain = covariance @ of_unit.T @ np.linalg.pinv(of_unit @ covariance @ of_unit.T, rcond=1e-6)
         axis = screw - gain @ ((misses(axis) + J @ (screw - axis)) / size[:, 0])
     apart, L = axis - screw, np.tensordot(axis, E, 1)[:3, :3]
-    per_rad = axis / math.sqrt(max(-0.5 * np.trace(L @ L), 1e-300))
+    per_rad = axis / math.sqrt(max(-0.5 * np.trace(L @ L), 1e-24))
     return per_rad, float(apart @ np.linalg.solve(covariance, apart))

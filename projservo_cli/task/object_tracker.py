@@ -90,8 +90,9 @@ class _State(NamedTuple):
 
 
 class _Shared(NamedTuple):
-    """Errors that all frames share, at a displacement (4, 4) and rates (g,)."""
+    """Errors that all frames share, at a time, a displacement (4, 4) and rates (g,)."""
 
+    t: float  # s
     T: FloatArray
     rates: FloatArray
     weight: FloatArray  # (V, k) of the views there
@@ -250,7 +251,7 @@ class ObjectTracker:
             E=np.linalg.solve(G, self._E) @ G,
             rates=state.rates,
             by_images=state.P,
-            by_calibration=self._shared.errors,
+            by_calibration=self._shared_errors(t),
             speed_mm_s=self._unit_mm * float(np.linalg.norm(state.T[:3, :3] @ state.rates[:3])),
             speed_px_s=self._moved_px(state.rates),
         )
@@ -259,7 +260,7 @@ class ObjectTracker:
         """Return a goal of the tool, taught with the object, at a time, s; as ``DisplacedObject.carry``."""
         state, g = self._predicted(self._state, t), len(self._E)
         N, c = (by.shape[-1] for by in self._X_by)
-        by_shape, by_calibration, alike = np.split(self._shared.errors[:g], [N, N + c], axis=1)
+        by_shape, by_calibration, alike = np.split(self._shared_errors(t)[:g], [N, N + c], axis=1)
         values, vectors = np.linalg.eigh(state.P[:g, :g])
         by_images = np.hstack([vectors * np.sqrt(np.maximum(values, 0.0)), by_shape, alike])
         return self._found.carry(goal, Displaced(state.T, np.eye(4), self._E, by_images, by_calibration))
@@ -282,15 +283,24 @@ class ObjectTracker:
 
     def _predicted(self, state: _State, t: float) -> _State:
         """State at a time, by rates that stay and accelerations by chance."""
-        dt, g = t - state.t, len(self._E)
+        dt = t - state.t
         if not math.isfinite(dt):
             return state._replace(t=t)
-        by = state.rates @ self._brackets
-        turned = np.eye(g) - dt * by + 0.5 * dt * dt * (by @ by)
-        F = np.eye(2 * g)
-        F[:g, :g], F[:g, g:] = turned, dt * np.eye(g) - 0.5 * dt * dt * by
+        F = self._transition(state.rates, dt)
         noise = _by(abs(dt) ** 3 / 3.0, dt * dt / 2.0, abs(dt), self._acceleration**2 * _LASTS_S)
         return _State(t, self._stepped(state.T, dt * state.rates), state.rates, F @ state.P @ F.T + noise)
+
+    def _transition(self, rates: FloatArray, dt: float) -> FloatArray:
+        """Errors (2 g, 2 g) of displacement and rates after a time, s, by those before."""
+        g, by, F = len(self._E), dt * (rates @ self._brackets), np.eye(2 * len(self._E))
+        F[:g, :g] += 0.5 * by @ by - by
+        F[:g, g:] = dt * (np.eye(g) - 0.5 * by)
+        return F
+
+    def _shared_errors(self, t: float) -> FloatArray:
+        """Errors (2 g, c) at a time, s, that all frames share."""
+        last = self._shared
+        return last.errors if math.isinf(last.t) else self._transition(last.rates, t - last.t) @ last.errors
 
     def _sudden(self, dt: float) -> FloatArray:
         """Covariance (2 g, 2 g) that the largest acceleration adds in a time, s."""
@@ -416,8 +426,10 @@ class ObjectTracker:
             if self._moved_px((step - last)[:g]) < _LINEAR_PX:
                 break
             seen = self._seen(there, rates, *images)
-        every, xi = seen.N[used].sum(axis=0), seen.by_itself(used)
-        measured = self._stepped(seen.T, xi)
+        xi = seen.by_itself(used)
+        raw = seen.r + (images.weight[..., None] * self._learnt).reshape(len(seen.r), -1)
+        every, b = seen.N[used].sum(axis=0), np.einsum("vng,vn->g", seen.A[used], raw[used])
+        measured = self._stepped(seen.T, np.linalg.lstsq(every, b)[0])
         if len(self._history) >= _FIRST:  # else views of other times seem to disagree
             self._learn(seen.r - seen.A @ xi, used, images.weight)
         self._history.append((state.t, int(used.sum()), measured, every))
@@ -442,7 +454,8 @@ class ObjectTracker:
         last = self._shared
         weight = np.where(weight > 0.0, weight, np.where(self._count > 0, last.weight, 0.0))
         moved = np.sqrt(np.square(self._X @ (state.T - last.T).T).sum(axis=1).mean())
-        faster = _AHEAD_S * np.linalg.norm((state.rates - last.rates) * self._size)
+        ahead = _AHEAD_S + (0.0 if math.isinf(last.t) else state.t - last.t)
+        faster = ahead * np.linalg.norm((state.rates - last.rates) * self._size)
         if max(moved, faster) * self._px > _ALIKE_WITHIN_PX or not np.array_equal(
             last.weight > 0.0, weight > 0.0
         ):
@@ -472,7 +485,7 @@ class ObjectTracker:
         covariance, change = (part @ part.swapaxes(1, 2) for part in (flat, change))
         change = change + ALIKE_PX**2 * np.eye(change.shape[1])
         both = np.concatenate([errors[0], rate])
-        return _Shared(state.T, state.rates, weight, A[0], covariance, change, both)
+        return _Shared(state.t, state.T, state.rates, weight, A[0], covariance, change, both)
 
 
 def _by(place: float, both: float, rate: float, share: FloatArray) -> FloatArray:
