@@ -18,6 +18,7 @@ from typing import NamedTuple, Self
 
 import numpy as np
 from scipy.linalg import expm
+from scipy.optimize import brentq
 from scipy.special import chdtri
 
 from projservo_cli.findings import LIMITS, REFUSES, Finding, Subject
@@ -33,7 +34,7 @@ from projservo_cli.task.object_bundle_adjustment import ObjectView
 _LASTS_S, _LEVER = 0.1, 4.0
 # Chances by which residuals of a view are of no motion; views disagree; a motion is not as predicted; its
 # acceleration is beyond its limit.
-_UNLIKE, _DISAGREE, _SUDDEN, _BEYOND = 1e-5, 1e-6, 1e-4, 1e-6
+_UNLIKE, _DISAGREE, _SUDDEN, _BEYOND = 1e-5, 1e-6, 1e-4, 1e-4
 # Chance by which a view that was left out still has to be alike to be used again.
 _ALIKE = 0.05
 # Motion of the images, rms px, by which a step is linearized again, and errors are; most steps.
@@ -404,16 +405,18 @@ class ObjectTracker:
             return
         state = self._predicted(before, t)
         seen = self._seen(state.T, state.rates, *images)
-        xi = seen.by_itself(used)
-        off = max(float(np.linalg.norm(part)) for part in np.split(xi * self._most[0] / self._most, [3]))
-        most = 0.5 * float(self._most[0]) * (t - since) ** 2
-        share = max(1.0 - most / max(off, 1e-300), 0.0)
-        if share**2 * seen.off(used, state.P) > chdtri(len(xi), _BEYOND):
+        N, g = seen.N[used].sum(axis=0), len(self._E)
+        P = state.P[:g, :g]
+        size = 0.5 * self._most * (t - since) ** 2
+        W = size[:, None] * (N - N @ P @ np.linalg.solve(np.eye(g) + N @ P, N)) * size
+        y = seen.by_itself(used) / size
+        if _beyond(W, y) > chdtri(g, _BEYOND):
             known = not math.isnan(self._unit_mm)
             per, unit = (self._unit_mm / MM, "m") if known else (self._px, "px")
-            self.pushed = self.pushed or Finding(
-                "pushed_object", REFUSES, self._of, per * off, limit=per * most, unit=unit
-            )
+            surest = W @ y / np.linalg.norm(W @ y)
+            off, most = (float(per * size[0] * one) for one in (y @ surest, 1.0))
+            found = Finding("pushed_object", REFUSES, self._of, off, limit=most, unit=unit)
+            self.pushed = self.pushed or found
 
     def _updated(self, state: _State, seen: _Seen, used: BoolArray, images: _Images) -> _State:
         """State with the images of some views (V,), linearized again where a step is large."""
@@ -488,6 +491,21 @@ class ObjectTracker:
         change = change + ALIKE_PX**2 * np.eye(change.shape[1])
         both = np.concatenate([errors[0], rate])
         return _Shared(state.t, state.T, state.rates, weight, A[0], covariance, change, both)
+
+
+def _beyond(W: FloatArray, y: FloatArray) -> float:
+    """χ² of a motion (g,) with the inverse covariance W (g, g) against the likeliest of no more than 1."""
+    values, vectors = np.linalg.eigh(W)
+    values, along = np.maximum(values, 1e-12 * values[-1]), vectors.T @ y
+
+    def over(mu: float) -> float:
+        return float(np.linalg.norm(values * along / (values + mu))) - 1.0
+
+    if over(0.0) <= 0.0:
+        return 0.0
+    # With the largest value times the motion as a multiplier, less than 1 of it is left.
+    mu = brentq(over, 0.0, float(values[-1] * np.linalg.norm(along)))
+    return float((values * np.square(along * mu / (values + mu))).sum())
 
 
 def _by(place: float, both: float, rate: float, share: FloatArray) -> FloatArray:
