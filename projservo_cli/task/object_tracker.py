@@ -181,7 +181,10 @@ class ObjectTracker:
         lever = np.r_[np.ones(3), np.full(g - 3, 1.0 / (_LEVER * self._radius))]
         self._acceleration, self._most = acceleration * per_unit * lever, max_acceleration * per_unit * lever
         self._captured, self._shown = np.full(len(view), -math.inf), -math.inf
-        self._used = self._left_out = np.zeros(len(view), dtype=bool)
+        self._left_out = np.zeros(len(view), dtype=bool)
+        self._last = _Images(
+            np.full((*weight.shape, 2), math.nan), np.zeros(weight.shape), np.zeros(len(view))
+        )
         self._history: deque[tuple[float, int, FloatArray, FloatArray]] = deque(maxlen=_LAST)
         self.covered: Finding | None = None
         self.pushed: Finding | None = None
@@ -229,8 +232,7 @@ class ObjectTracker:
         seen = self._seen(state.T, state.rates, *images)
         near = self._near(seen, fresh, state, images)
         used = self._agreeing(seen, near, fresh, state.P)
-        self._captured[fresh] = t[fresh]
-        self._left_out = (self._left_out & ~fresh) | (fresh & ~used)
+        self._compare(t, images, fresh, used)
         views = tuple(self._view[v] for v in np.flatnonzero(self._left_out))
         self.covered = Finding("covered_object", LIMITS, replace(self._of, views=views)) if views else None
         if not used.any():
@@ -240,10 +242,9 @@ class ObjectTracker:
                 if self._alike >= _FIRST and math.isfinite(self._most[0]):
                     self._before = self._before or [(self._earlier, self._state)]
                 state = state._replace(P=state.P + self._sudden(dt))
-            self._judge(state.t, used, images)
+            self._judge(state.t)
         self._earlier, self._state = self._state.t, self._updated(state, seen, used, images)
-        self._alike = self._alike + 1 if np.array_equal(used, self._used) else 0
-        self._used, self._shown = used, state.t
+        self._shown = state.t
 
     def at(self, t: float) -> ObjectMotion:
         """Return the motion at a time, s, from the last images on by rates that stay."""
@@ -392,19 +393,31 @@ class ObjectTracker:
             used[min(np.flatnonzero(used).tolist(), key=without)] = False
         return used
 
-    def _judge(self, t: float, used: BoolArray, images: _Images) -> None:
+    def _compare(self, t: FloatArray, images: _Images, fresh: BoolArray, used: BoolArray) -> None:
+        """Note which fresh views are used, and since when the same are; keep their last images."""
+        returned = fresh & (t - self._captured > _JUDGED_S)
+        same = np.array_equal(used[fresh], ~self._left_out[fresh]) and not returned.any()
+        self._alike = self._alike + 1 if same else 0
+        if not same:
+            self._before.clear()
+        self._captured[fresh], self._left_out[fresh] = t[fresh], ~used[fresh]
+        self._last.s[fresh], self._last.weight[fresh] = images.s[fresh], images.weight[fresh]
+
+    def _judge(self, t: float) -> None:
         """Hold what came of a sudden change against the largest acceleration, from before it on.
 
-        By the same views all the while, two or more: errors that frames share drop out.
+        By the last images of the same views all the while, two or more: errors that frames share drop out.
         """
-        if not self._before:
+        ago = t - self._captured
+        used = (ago < _JUDGED_S) & ~self._left_out
+        if not self._before or used.sum() < 2:
             return
         since, before = self._before[0]  # it may have begun with the frame before
-        if t - before.t > _JUDGED_S or used.sum() < 2 or not np.array_equal(used, self._used):
+        if t - before.t > _JUDGED_S:
             self._before.clear()
             return
         state = self._predicted(before, t)
-        seen = self._seen(state.T, state.rates, *images)
+        seen = self._seen(state.T, state.rates, *self._last._replace(ago=np.where(used, ago, 0.0)))
         N, g = seen.N[used].sum(axis=0), len(self._E)
         P = state.P[:g, :g]
         size = 0.5 * self._most * (t - since) ** 2

@@ -231,18 +231,24 @@ def test_a_hand_over_one_camera_is_left_out(kind, arm, c, rng):
     assert all(said[i][1].subject.views == ("left",) for i in expected)
     assert all(pushed is None and unseen == 0.0 for _, _, pushed, unseen in said)
     assert max(off_mm(arm, motion, BELT) for motion, *_ in said[5:]) < 10.0
-    assert off_mm(arm, said[-1][0], BELT) < 1.0
+    assert off_mm(arm, said[-1][0], BELT) < 2.0  # of a stated deviation of 0.8
 
 
-@pytest.mark.parametrize("axis", np.eye(3), ids=["across", "up", "deep"])
-def test_a_push_is_found(axis, arm, c, rng):
-    """By 30 mm within 80 ms, in any direction: the speed changes by 9 times what 1 m/s² does in 40 ms."""
+def pushing(axis):
+    """A path that a push across that of a belt by 30 mm within 80 ms interrupts."""
 
-    def pushed(t):
+    def path(t):
         by = np.eye(4)
         by[:3, 3] = 0.03 * np.clip((t - 1.0) / 0.08, 0.0, 1.0) * axis
         return by @ BELT(t)
 
+    return path
+
+
+@pytest.mark.parametrize("axis", np.eye(3), ids=["across", "up", "deep"])
+def test_a_push_is_found(axis, arm, c, rng):
+    """In any direction: the speed changes by 9 times what 1 m/s² does in 40 ms."""
+    pushed = pushing(axis)
     tracker = tracker_of(arm, c, BELT)
     said = followed(tracker, arm, pushed, 50, rng)
     first = next(i for i, (*_, found, _) in enumerate(said) if found is not None)
@@ -252,6 +258,23 @@ def test_a_push_is_found(axis, arm, c, rng):
     assert one.amount > one.limit >= 0.5 * 1e-3 * MOST * (2 * PERIOD) ** 2 - 1e-12
     assert "part" in messages.sentence(one)
     assert off_mm(arm, said[-1][0], pushed) < 1.5
+
+
+def test_a_push_is_found_by_cameras_that_take_turns(arm, c, rng):
+    """Each takes an image every 40 ms, the other one between; without a push none is found."""
+
+    def taking_turns(i, s):
+        s[i % 2] = math.nan
+        return s
+
+    for path in (BELT, pushing(np.array([1.0, 0.0, 0.0]))):
+        tracker = tracker_of(arm, c, path)
+        for i in range(80):
+            t = np.full(2, 0.5 * PERIOD * i)
+            tracker.observe(t, taking_turns(i, noisy(seen_at(arm, path, t), rng)))
+        assert (tracker.pushed is not None) == (path is not BELT)
+        assert tracker.covered is None
+        assert off_mm(arm, tracker.at(t[0]), path) < 3.0
 
 
 def course(speed, at, lasting, to):
