@@ -47,8 +47,8 @@ _AHEAD_S, _LEARNT, _MEMORY = 0.5, 10, 25
 _JUDGED_S, _FIRST = 0.2, 10
 # Frames by which the kind of a motion is told.
 _LAST = 80
-# Unknown displacements and rates at the start, radii and rad of the object, and per s.
-_WIDE = 10.0
+# Deviations of unknown displacements, in radii of the object and rad, and of its rates, in radii/s and rad/s.
+_WIDE, _FAST, _TURNS = 10.0, 10.0, 1.0
 
 
 class ObjectMotion(NamedTuple):
@@ -169,8 +169,9 @@ class ObjectTracker:
         self._radius = float(np.sqrt(np.square(points.X[:, :3] - middle).sum(axis=1).mean()))
         self._size = np.r_[np.full(3, self._radius), np.ones(len(self._E) - 3)]
         T, g = rig.G @ found.D @ np.linalg.inv(rig.G), len(self._E)
-        wide = _WIDE**2
-        self._state = _State(-math.inf, T, np.zeros(g), _by(wide, 0.0, wide, self._size**2))
+        self._fast = self._size * np.r_[np.full(3, _FAST), np.full(g - 3, _TURNS)]
+        P = _by(_WIDE**2, 0.0, 0.0, self._size**2) + _by(0.0, 0.0, 1.0, self._fast**2)
+        self._state = _State(-math.inf, T, np.zeros(g), P)
         self._alike, self._scatters = 0, False  # frames in a row by the same views
         self._earlier, self._before = -math.inf, list[tuple[float, _State]]()
         weight = np.full((len(view), len(points.X)), 1.0 / rig.sigma_px)
@@ -237,7 +238,9 @@ class ObjectTracker:
         self.covered = Finding("covered_object", LIMITS, replace(self._of, views=views)) if views else None
         if not used.any():
             return
-        if math.isfinite(dt := state.t - self._state.t):
+        if math.isinf(dt := state.t - self._state.t):
+            state, seen = state._replace(T=near.T), near
+        else:
             if seen.off(used, state.P) > chdtri(len(self._E), _SUDDEN):
                 if self._alike >= _FIRST and math.isfinite(self._most[0]):
                     self._before = self._before or [(self._earlier, self._state)]
@@ -309,7 +312,7 @@ class ObjectTracker:
     def _sudden(self, dt: float) -> FloatArray:
         """Covariance (2 g, 2 g) that the largest acceleration adds in a time, s."""
         if not math.isfinite(self._most[0]):
-            return _by(1.0, 0.0, _WIDE**2, self._size**2)
+            return _by(1.0, 0.0, 0.0, self._size**2) + _by(0.0, 0.0, 1.0, self._fast**2)
         return _by(dt**4 / 4.0, dt**3 / 2.0, dt**2, self._most**2)
 
     def _stepped(self, T: FloatArray, xi: FloatArray) -> FloatArray:
@@ -361,6 +364,7 @@ class ObjectTracker:
         dt, total = state.t - self._state.t, np.zeros(len(self._E))
         for _ in range(_STEPS):
             xi = seen.by_itself(fresh)
+            xi = xi / max(1.0, float(np.abs(xi / self._size).max()))  # no more than its size at once
             if self._moved_px(xi) < _LINEAR_PX:
                 break
             total = total + xi
