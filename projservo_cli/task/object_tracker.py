@@ -246,8 +246,8 @@ class ObjectTracker:
                     self._before = self._before or [(self._earlier, self._state)]
                 state = state._replace(P=state.P + self._sudden(dt))
             self._judge(state.t)
-        self._earlier, self._state = self._state.t, self._updated(state, seen, used, images)
-        self._shown = state.t
+        if (updated := self._updated(state, seen, used, images)) is not None:
+            self._earlier, self._state, self._shown = self._state.t, updated, state.t
 
     def at(self, t: float) -> ObjectMotion:
         """Return the motion at a time, s, from the last images on by rates that stay."""
@@ -435,15 +435,21 @@ class ObjectTracker:
             found = Finding("pushed_object", REFUSES, self._of, off, limit=most, unit=unit)
             self.pushed = self.pushed or found
 
-    def _updated(self, state: _State, seen: _Seen, used: BoolArray, images: _Images) -> _State:
-        """State with the images of some views (V,), linearized again where a step is large."""
+    def _updated(self, state: _State, seen: _Seen, used: BoolArray, images: _Images) -> _State | None:
+        """State with the images of some views (V,), linearized again where a step is large.
+
+        None if no step leads there, as where few markers leave the motion open.
+        """
         g, step = len(self._E), np.zeros(2 * len(self._E))
+        most = _WIDE * np.concatenate([self._size, self._fast])
         by = [np.hstack([np.eye(g), -ago * np.eye(g)]) for ago in images.ago[used]]
         for _ in range(_STEPS):
             N = sum(M.T @ one @ M for M, one in zip(by, seen.N[used], strict=True))
             b = sum(M.T @ one for M, one in zip(by, seen.b[used], strict=True))
             gain = state.P @ np.linalg.inv(np.eye(2 * g) + N @ state.P)
             last, step = step, gain @ (b + N @ step)
+            if not (np.abs(step) < most).all():
+                return None
             there, rates = self._stepped(state.T, step[:g]), state.rates + step[g:]
             if self._moved_px((step - last)[:g]) < _LINEAR_PX:
                 break
@@ -451,10 +457,11 @@ class ObjectTracker:
         xi = seen.by_itself(used)
         raw = seen.r + (images.weight[..., None] * self._learnt).reshape(len(seen.r), -1)
         every, b = seen.N[used].sum(axis=0), np.einsum("vng,vn->g", seen.A[used], raw[used])
-        measured = self._stepped(seen.T, np.linalg.lstsq(every, b)[0])
+        alone = np.linalg.lstsq(every, b)[0]
         if len(self._history) >= _FIRST:  # else views of other times seem to disagree
             self._learn(seen.r - seen.A @ xi, used, images.weight)
-        self._history.append((state.t, int(used.sum()), measured, every))
+        if np.abs(alone / self._size).max() < 1.0:  # else few markers leave the motion open
+            self._history.append((state.t, int(used.sum()), self._stepped(seen.T, alone), every))
         return _State(state.t, there, rates, 0.5 * (gain + gain.T))
 
     def _learn(self, left: FloatArray, used: BoolArray, weight: FloatArray) -> None:

@@ -387,3 +387,24 @@ def test_any_constant_twist_is_tracked_whatever_the_frame(turn, by, ago):
         followed(tracker, arm, path, 6, ago=ago, sigma=SURE)
         predicted = np.linalg.inv(G) @ tracker.at(0.4).D @ G
         assert predicted == pytest.approx(path(0.4), abs=1e-4)
+
+
+@pytest.mark.parametrize("twelve", [False, True])
+def test_wild_images_leave_it_with_numbers(twelve, arm, c):
+    """Jumps, noise of 100 px, hidden corners and times that are missing, in 12 runs."""
+    robot = SCARA if twelve else arm
+    start = tracker_of(robot, exact(SCARA, frame(1)) if twelve else c, START_ONLY, metric=not twelve)
+    for seed in range(12):
+        rng, tracker, T = np.random.default_rng(seed), copy.deepcopy(start), START
+        for i in range(20):
+            turn, by = rng.choice([0.0, 0.01, 0.3]), rng.choice([0.0, 0.002, 0.05])
+            T = T @ displacement(turn * rng.standard_normal(3), by * rng.standard_normal(3))
+            s = noisy(pixels(robot.cameras, OBJECT @ T.T), rng, rng.choice([0.0, 0.5, 5.0, 100.0]))
+            s[rng.uniform(size=(2, 8)) < rng.choice([0.0, 0.3, 0.9])] = math.nan
+            t = i * PERIOD - rng.uniform(0.0, 0.05, 2)
+            t[0] = math.nan if rng.uniform() < 0.1 else t[0]
+            tracker.observe(t, s, None if rng.uniform() < 0.5 else np.full((2, 8), 0.3))
+            motion = tracker.at(i * PERIOD + 0.4)
+            assert np.isfinite(motion.D).all()
+            assert np.isfinite(motion.covariance).all()
+        assert tracker.kind.name in ("still", "belt", "turntable", "free")
