@@ -60,6 +60,19 @@ _FIRST_MODULES = {
 _ADDED: dict[str, dict[str, Any]] = {
     "Estimation": {"boards": (), "intrinsics": ()},
     "Markers": {"boards": None},
+    "ObjectSettings": {
+        "follow": False,
+        "acceleration": 100.0,
+        "max_acceleration": 2000.0,
+        "max_speed_mm_s": None,
+        "lost_s": 0.5,
+        "approach_mm": 0.0,
+        "velocity": None,
+        "path": None,
+    },
+    "RenderedScene": {"moving": ()},
+    "SceneObject": {"motion": None},
+    "Stop": {"follow_s": 2.0},
     **{name: {"flange_chart": None} for name in ("JointSettings", "OwnRobot", "Table")},
 }
 _KINDS = {

@@ -33,6 +33,7 @@ DRIVING = {
     "choose-your-rig",
     "commands",
     "first-law",
+    "follow-a-belt",
     "first-run",
     "planning",
     "python",
