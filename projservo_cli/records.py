@@ -1311,6 +1311,42 @@ class IncidenceHistory(RecordPart):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class GoalHistory(RecordPart):
+    """A goal that an object carried while a law ran, and how well it was followed from its arrival on."""
+
+    followed_rms_px: float | None = _optional_scalar(
+        "px", "image error to the goal where it was, rms over time"
+    )
+    followed_rms_mm: float | None = _optional_scalar(
+        "mm", "distance of the body, rms; none without a known length"
+    )
+    followed_max_mm: float | None = _optional_scalar("mm", "largest distance of the body; likewise")
+    followed_rms_deg: float | None = _optional_scalar(
+        "deg", "angle, rms; none if the joints leave angles open"
+    )
+    followed_seconds: float = _scalar("s", "time since the first arrival; 0 without one")
+    followed_speed_mm_s: float | None = _optional_scalar("mm/s", "mean speed of the object; likewise")
+    goal_time: FloatArray = _array("time", "s", "clock of the robot")
+    goal_error_px: FloatArray = _array(
+        "time", "px", "image error to the goal where it was; NaN if unmeasured"
+    )
+    goal_error_mm: FloatArray = _array("time", "mm", "distance of the body; NaN without a known length")
+    goal_error_deg: FloatArray = _array("time", "deg", "angle; NaN if the joints leave angles open")
+    goal_sigma_px: FloatArray = _array("time", "px", "stated deviation of the image error")
+    goal_s: FloatArray = _array("time view marker xy", "px", "images of the face at the goal then")
+    goal_displacement: FloatArray = _array(
+        "time row coordinate",
+        about="displacement of the goal since the plan, in the frame of the calibration",
+    )
+    goal_speed: FloatArray = _array(
+        "time", "mm/s or px/s", "speed of the object, px/s without a known length"
+    )
+    goal_unseen_s: FloatArray = _array("time", "s", "time since its object was seen")
+    goal_center: FloatArray = _array("time axis", "m", "true centre of the face at the goal; NaN if unknown")
+    goal_true_speed: FloatArray = _array("time", "mm/s", "true speed of the object; NaN if unknown")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class PlanFollowing(RecordPart):
     """Adherence of a run to its plan."""
 
@@ -1360,6 +1396,7 @@ class Trace(Composite):
     history: RunHistory
     truth: TrueMotion
     of_incidences: IncidenceHistory | None = None
+    of_goal: GoalHistory | None = None
     frames: RecordedFrames | None = None
 
     def __getattr__(self, name: str) -> Any:

@@ -61,6 +61,19 @@ _ADDED: dict[str, dict[str, Any]] = {
     "Estimation": {"boards": (), "intrinsics": (), "focal_std_fraction": 0.005, "center_std_fraction": 0.01},
     "Markers": {"boards": None},
     **{name: {"staggered": False} for name in ("KnownBoard", "StatedBoard")},
+    "ObjectSettings": {
+        "follow": False,
+        "acceleration": 100.0,
+        "max_acceleration": 2000.0,
+        "max_speed_mm_s": None,
+        "lost_s": 0.5,
+        "approach_mm": 0.0,
+        "velocity": None,
+        "path": None,
+    },
+    "RenderedScene": {"moving": ()},
+    "SceneObject": {"motion": None},
+    "Stop": {"follow_s": 2.0},
     **{name: {"flange_chart": None} for name in ("JointSettings", "OwnRobot", "Table")},
 }
 # Records whose fields count as those of the record that holds them, as they did at first.

@@ -17,7 +17,7 @@ from projservo_cli.config.settings_and_rules import carriers_of, truth_of
 from projservo_cli.records import ANGLE, MEET, MM, PARALLEL, PERPENDICULAR, TOOL, FloatArray, InputError
 from projservo_cli.result_hashes import File
 from projservo_cli.settings.control import LawSettings, SpeedLimits
-from projservo_cli.settings.disturbance import Disturbance, Events, Faults
+from projservo_cli.settings.disturbance import Disturbance, EachView, Events, Faults
 from projservo_cli.settings.features import Feature, Pair
 from projservo_cli.settings.markers import Markers
 from projservo_cli.settings.noise_and_data import LoopNoise
@@ -29,6 +29,7 @@ from projservo_cli.simulation.from_settings import (
     cameras_of,
     center_in_face,
     described_scene,
+    scene_object,
 )
 from projservo_cli.simulation.ground_truth import SceneObject, Truth
 from projservo_cli.simulation.mjcf import files_named
@@ -65,6 +66,7 @@ from projservo_cli.task.incidences import Incidence
 from projservo_cli.task.stand_off import StandOff
 
 _RANDOM_POSES = 12  # number in trials whose joints or images may have faults
+_NO_LATENCY = EachView(left=0.0, right=0.0, others=0.0)  # of the ideal plant
 _TICKS = 4096  # counts per turn of the coarsest encoders
 _EXPECTED = {
     "table": "a table, which projservo record calibrate makes",
@@ -324,25 +326,23 @@ def _carrier(config: Config, files: Files | None, name: str, goal: GoalSettings)
 
 def objects_of(config: Config) -> tuple[SceneObject, ...]:
     """Objects of the simulated scene; those without places are left out."""
-    return tuple(
-        SceneObject(name, one.numbers, points, one.normals, one.moved)
-        for name, one in config.objects.named.items()
-        if (points := one.points) is not None
-    )
+    placed = ((name, one) for name, one in config.objects.named.items() if one.is_placed)
+    return tuple(scene_object(name, one) for name, one in placed)
 
 
 def _contract(config: Config, plan: PlanInputs, files: Files | None) -> Contract | None:
     """Return the settings of a robot of the contract; None for the ideal plant."""
     plant = config.plant
-    if plant.use is None and config.disturbance == Disturbance():
+    moves = any(one.follow or one.motion is not None for one in config.objects.named.values())
+    ideal = plant.use is None and config.disturbance == Disturbance()
+    if ideal and not moves:
         return None
     driven = _drive(config, plan.described.truth, files, shows=True)
     settle_s = plant.settle_s if plan.described.truth is None else None
+    offset_s = _NO_LATENCY if ideal and plant.time_offset_s is None else plant.time_offset_s
     table = config.data.table if config.data is not None and plan.described.truth is None else ""
     identity = identity_in(table) if table and Path(table).is_file() else ""
-    return Contract(
-        driven, config.disturbance.part(Events), plant.timeout_s, plant.time_offset_s, settle_s, identity
-    )
+    return Contract(driven, config.disturbance.part(Events), plant.timeout_s, offset_s, settle_s, identity)
 
 
 def report_inputs(config: Config, files: Files | None = None) -> ReportInputs:
@@ -445,7 +445,8 @@ def scene_of(
         for tag in config.objects.named[name].placed
     ]
     mjcf = _file_if("mjcf", config.arm.mjcf, files)
-    return described_scene(config.arm, config.rig, _markers(config), options, mjcf, tuple(tags))
+    moving = tuple((name, now) for name, now in (objects or {}).items() if now and now.motion is not None)
+    return described_scene(config.arm, config.rig, _markers(config), options, mjcf, tuple(tags), moving)
 
 
 # Values that drive a robot.

@@ -233,6 +233,29 @@ def _carried(
                 yield ("task", *path, "on"), f"there is no object {carrier}; {known}"
 
 
+@_between
+def _followed(
+    objects: Objects, features: Mapping[str, Feature], task: TaskSettings | None, control: Control
+) -> Iterator[Note]:
+    """Goals that cannot be followed, and laws that cannot be led to them by one time."""
+    followed = {name for name, one in objects.named.items() if one.follow}
+    carriers = [carriers_of(goal, features) for goal in ({} if task is None else task.each_goal).values()]
+    for names in (names for names in carriers if followed & {*names}):
+        if len(names) > 1:
+            what = f"a goal that is followed is on one object, and this one on {' and '.join(names)}"
+            yield ("task",), what
+        if control.mode != ("regulate",):
+            yield (
+                ("control", "mode"),
+                "plans lead to where an object was: a goal is followed by regulate alone",
+            )
+        gains = {getattr(control, name) for name in ("gain_t", "gain_r", "gain_p", "gain_s", "gain")}
+        if len(gains) > 1:
+            what = "gains differ, and a goal that is followed is led by 1/gain: make all five the same"
+            yield ("control", "gain_t"), what
+        return
+
+
 def _carried_by(
     carrier: str,
     numbers: Sequence[int],

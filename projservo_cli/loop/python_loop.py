@@ -121,11 +121,22 @@ class Monitor(Protocol):
         """Return the new verdict."""
 
 
+class MovingTarget(Monitor, Protocol):
+    """Interface of a goal that moves, and of the monitor that rules over its run."""
+
+    def lead(self) -> FloatArray:
+        """Give the law the goal where it will be, and return the images (V, m, 2) of the face where it is."""
+
+    def judge(self) -> float:
+        """Return the image error by which the run is judged, px, once the law measured."""
+
+
 class Monitors(NamedTuple):
     """Monitors of a run, asked in the order that the module states."""
 
     plant: Monitored
     limits: Limits
+    goal: MovingTarget | None = None
     stall: Monitor | None = None
     execution: Monitor | None = None
 
@@ -143,7 +154,7 @@ class Monitors(NamedTuple):
     def of_instant(self, log: Log, k: int, now: Instant) -> int:
         """Verdict of an instant at which the law was asked."""
         verdict = verdict_at(log, k, now, self.limits)
-        for monitor in (self.stall, self.execution):
+        for monitor in (self.goal, self.stall, self.execution):
             if monitor is not None:
                 verdict = monitor.ruled(log, k, verdict, now.q_dot)
         waits = self.plant.pending and k < self.limits.max_steps
@@ -152,8 +163,9 @@ class Monitors(NamedTuple):
     def of_command(self, log: Log, k: int, asked: Command) -> int:
         """Verdict of a command, which is bounded."""
         verdict = bounded(log, k, asked, self.plant.plant, self.limits)
-        if verdict != RUNNING and self.execution is not None:
-            verdict = self.execution.ruled(log, k, verdict, asked.q_dot)
+        for monitor in (self.goal, self.execution):
+            if verdict != RUNNING and monitor is not None:
+                verdict = monitor.ruled(log, k, verdict, asked.q_dot)
         return verdict
 
 
@@ -217,6 +229,11 @@ class BuiltInLaw:
         self.state.plan.clock[0] = 0.0
         self._bound = None
 
+    def aim(self, task: Task) -> None:
+        """Take another goal; the plan that is followed, and its time, stay."""
+        self.law = self.law._replace(task=self._weighed(task)._replace(reference=self.law.task.reference))
+        self._bound = None
+
     def _weighed(self, task: Task) -> Task:
         """The task with the weights of this law, which ``weigh`` changes."""
         return task._replace(body=task.body._replace(weight=self._weight))
@@ -252,6 +269,7 @@ def run_in_python(
     limits: Limits,
     scale: float = 1.0,
     *,
+    goal: MovingTarget | None = None,
     stall: Monitor | None = None,
     execution: Monitor | None = None,
 ) -> tuple[int, int, Log]:
@@ -259,6 +277,7 @@ def run_in_python(
 
     plant : any; it is stopped however the run ends.
     s_star : (V, m, 2) target pixels; period : control period, s; scale : factor of every command.
+    goal : that moves, in place of the target pixels.
     stall : of a robot that may lag behind its set-points; execution : of a plan that another may replace.
     Returns verdict, steps, log: as of the compiled loop, to the bit for the built-in laws. Raises InputError
     if the law has an attribute that is a misspelt one of ``_OPTIONAL``; WorkFailed if the plant or the law
@@ -270,7 +289,7 @@ def run_in_python(
         log = new_log(n, plant.markers, limits.max_steps, len(ERRORS), views=V)
         for column in (log.read, log.q, log.s, log.error, log.judged):
             column[:] = math.nan
-        monitors = Monitors(plant, limits, stall, execution)
+        monitors = Monitors(plant, limits, goal, stall, execution)
         k, verdict = 0, RUNNING
         while verdict < 0:
             try:
@@ -306,6 +325,8 @@ def _instant(
     log.s[k] = plant.observe()
     log.hidden[k] = plant.hidden
     distance = plant.distance()
+    if monitors.goal is not None:
+        s_star = monitors.goal.lead()
     left = note(log, k, s_star, plant.plant, monitors.limits)
     status, q_dot = OK, np.zeros_like(log.read[k])
     verdict = monitors.of_faults(k)
@@ -318,6 +339,8 @@ def _instant(
         log.errors[k], log.fit[k] = law.errors, _optional(law, "fit")
         face_px = float(_optional(law, "face_px")[0])
         log.judged[k] = face_px if math.isfinite(face_px) else log.judged[k]
+        if monitors.goal is not None:
+            log.judged[k] = monitors.goal.judge()
     now = Instant(plant.in_front, left, distance, status, q_dot, plant.noise_ratio)
     return monitors.of_instant(log, k, now), q_dot
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 from projservo_cli.geometry.algebra import Mat4, Vec4, apply, axpy, dot, mat, mul, sub, vec, vec_into
 from projservo_cli.geometry.jit import inline, merged, njit
 from projservo_cli.geometry.kinematics import backward, beyond_limits, forward
-from projservo_cli.loop.verdicts import CONVERGED, Log
+from projservo_cli.loop.verdicts import CONVERGED, FOLLOWED, Log
 from projservo_cli.records import MM, FloatArray
 from projservo_cli.simulation.analytic_plant import Ends, Plant, shows_face
 from projservo_cli.task.face import center_of
@@ -65,7 +65,7 @@ def summarize(plant: Plant, log: Log, ended: Ended, period: float, ends: Ends) -
         pose_first = mul(backward(plant.model, log.q[0]), base_tool)
         pose = mul(backward(plant.model, log.q[steps]), base_tool)
         error = _distance(_origin(pose), _origin(goal_pose))
-    arrived = ended.verdict == CONVERGED
+    arrived = ended.verdict in (CONVERGED, FOLLOWED)
     return Summary(
         success=1.0 if arrived and _keeps_within(plant, log, steps) else 0.0,
         image_error_px=float(log.error[steps]),

@@ -38,6 +38,10 @@ FAILED = VERDICT_NAMES.index("failed")
 FOLLOWING_ERROR = VERDICT_NAMES.index("following error")
 OBJECT_MOVED = VERDICT_NAMES.index("object moved")
 INTERRUPTED = VERDICT_NAMES.index("interrupted")
+FOLLOWED = VERDICT_NAMES.index("followed")
+LOST_GOAL = VERDICT_NAMES.index("lost goal")
+OUT_OF_REACH = VERDICT_NAMES.index("out of reach")
+TOO_FAST = VERDICT_NAMES.index("too fast")
 PLATEAU_FALL = 0.01
 # Joint steps below this, rad or m, are none.
 _NO_MOTION = 1e-6

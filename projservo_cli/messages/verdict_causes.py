@@ -91,6 +91,28 @@ VERDICTS = {
     "interrupted": Verdict(
         "the user ended it, as with Ctrl-C; its trace up to there is kept", "", ends=True, retried=True
     ),
+    "followed": Verdict(
+        "the image error to a goal that moves stayed within three times its stated deviation, rms over "
+        "stop.follow_s",
+        "",
+        names=("follow", "follow_s"),
+        arrived=True,
+    ),
+    "lost goal": Verdict(
+        "no camera shows the object that carries the goal for too long to predict where it is",
+        "look what hides it, and at light and exposure, or raise objects.NAME.lost_s",
+        names=("lost_s", "approach_mm"),
+    ),
+    "out of reach": Verdict(
+        "a goal that moves is about to leave the images or the limits of the joints",
+        "begin earlier, slow the object down, or turn the cameras and the arm to where it goes",
+        names=("follow",),
+    ),
+    "too fast": Verdict(
+        "the object that carries the goal is faster than its limit",
+        "slow it down, or raise objects.NAME.max_speed_mm_s",
+        names=("max_speed_mm_s",),
+    ),
     "not calibrated": Verdict("a run of a sweep has no calibration", "look why it is refused"),
     "not started": Verdict("a run of a sweep could not begin", "read its reason"),
 }
@@ -128,6 +150,11 @@ REASONS = {
         "teach it again",
     ),
     "blind_camera": Row("the {view} camera has shown no marker of the face since step {count}", "check it"),
+    "followed": Row("{name} {amount} rms over stop.follow_s is within {limit}"),
+    "goal_unseen": Row("no camera has shown its object for {amount} ({limit} at most)"),
+    "goal_fast": Row("its object moves at {amount} ({limit} at most)"),
+    "goal_leaves_view": Row("in {amount} the goal leaves the image of the {view} camera"),
+    "goal_leaves_reach": Row("in {amount} the goal takes {joints} beyond its limit"),
     "replanned": Row("replanned at step {count} ({because})"),
     "replanned_in_vain": Row("replanned at step {count} ({because}) in vain"),
     "passed_over": Row("passed over where the face is lost to step {count}"),
@@ -160,6 +187,16 @@ REASONS = {
         "the object {name}, markers {ends}, has moved since the motion was planned, by {amount} in "
         "{the_images} ({limit} at most)",
         "let it lie still, and plan again",
+    ),
+    "covered_object": Row(
+        "the object {name}, markers {ends}, is covered in {the_images}: they show no motion of it, or "
+        "another than the others",
+        "keep the view of it free",
+    ),
+    "pushed_object": Row(
+        "the object {name}, markers {ends}, is {amount} from where its motion would have taken it ({limit} "
+        "at most)",
+        "look what pushed it, or raise its max_acceleration",
     ),
     "unseen_markers": Row("{dark} of the calibration"),
 }

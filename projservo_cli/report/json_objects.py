@@ -94,9 +94,16 @@ def _laws(run: Run, laws: Sequence[str]) -> dict[str, Any]:
     return {"laws": list(values.values())} | ({"steps": steps} if steps else {})
 
 
+# Numbers of a goal that was followed.
+_FOLLOWED = ("rms_px", "rms_mm", "max_mm", "rms_deg", "seconds", "speed_mm_s")
+
+
 def _law(trace: Trace) -> dict[str, Any]:
     """Plain values of the run of a law, with the errors of its incidences at the end."""
     values, found = scalars_of(trace), trace.of_incidences
+    followed = {name: values.pop(f"followed_{name}") for name in _FOLLOWED}
+    if trace.of_goal is not None:
+        values["following"] = followed
     if found is None:
         return values
     units = "mm", "deg", "deviation_mm", "deviation_deg"

@@ -25,6 +25,7 @@ from projservo_cli.robots.latency_estimation import DelayPrior, Delays, squares_
 from projservo_cli.robots.object_watch import ObjectWatch
 from projservo_cli.robots.pacing import Steered
 from projservo_cli.simulation.analytic_plant import Plant, observe
+from projservo_cli.task.object_tracker import ObjectTracker
 
 # Markers that no detector sees at one pixel.
 _AT_ONE_PIXEL = 3
@@ -53,6 +54,14 @@ class Known(NamedTuple):
     max_force_n: float | None = None  # on the tool, N; None for any
 
 
+class Tracked(NamedTuple):
+    """An object that carries a goal while it moves."""
+
+    name: str
+    places: Sequence[int]  # (k,) of its markers among the markers of objects
+    tracker: ObjectTracker
+
+
 class DrivenRobot:
     """A robot with its cameras, and the plant that models it.
 
@@ -65,7 +74,7 @@ class DrivenRobot:
         true joints.
     known : of robot and images.
     monitor : of the raw images against the calibration; None tests nothing.
-    watch : over the object that carries the goal; None without one.
+    watches : over objects that carry the goal and rest; tracked : the one that carries it while it moves.
     ``q``: (n,) joint readings when last asked for, or the true joints, rad or m. ``H, hidden``: displacement
     of the face and self-occlusion there. ``in_front``: a camera sees nothing behind it. ``disturbance``: why
     the images no longer agree with the calibration, or the failure; otherwise None. ``weight``: (V, k) of the
@@ -86,9 +95,10 @@ class DrivenRobot:
         known: Known,
         monitor: ImageMonitor | None,
         watches: Sequence[ObjectWatch] = (),
+        tracked: Tracked | None = None,
     ) -> None:
         self.robot, self.steered, self.plant, self.watches = (robot := steered.robot), steered, plant, watches
-        self.known, self.monitor = known, monitor
+        self.known, self.monitor, self.tracked = known, monitor, tracked
         self.markers = len(known.visible)
         self._place = np.array([np.flatnonzero(known.order == i)[0] for i in known.visible])
         self._instants = Delays(
@@ -154,6 +164,7 @@ class DrivenRobot:
             self.noise_ratio = self._noise_of(reading.sigma_px[:, visible], reading.s[:, visible])
         frames = self._instants.update(reading.t_view, images, history)
         q_then = history.at(frames.t)
+        self._track(frames.t, frames.fresh)
         if self.monitor is not None:
             q_dot = np.stack([history.speed_at(float(t)) for t in frames.t])
             self.monitor.unanswered = self.steered.set_point.unanswered
@@ -172,6 +183,20 @@ class DrivenRobot:
             self._carried[view] = there[view] - then[view][view] if carries else 0.0
         self.delays.append(self._instants.mean)
         return np.ascontiguousarray(reading.s[:, visible]) + self._carried
+
+    def _track(self, t: FloatArray, fresh: BoolArray) -> None:
+        """Show the object that moves in new frames (V,), taken at times t (V,), s, to its tracker."""
+        if self.tracked is None or not fresh.any():
+            return
+        reading, (_, places, tracker) = self.steered.reading, self.tracked
+        s = np.where(fresh[:, None, None], reading.s_objects[:, places], np.nan)
+        sigma = np.full(s.shape[:2], max(self.known.sigma_px, MIN_SIGMA))
+        if reading.sigma_objects is not None:
+            sigma = reading.sigma_objects[:, places]
+        tracker.observe(t, s, sigma)
+        if tracker.pushed is not None and not self.disturbance:
+            self.disturbance = tracker.pushed
+            self._retreat()
 
     def _noise_of(self, sigma: FloatArray, s: FloatArray) -> float:
         """Stated noise (V, k) of pixels (V, k, 2) of a fit, over the noise of the run; at least 1."""
@@ -209,7 +234,9 @@ class DrivenRobot:
     @property
     def object_moved(self) -> bool:
         """Whether it is an object of the goal that ended the run."""
-        return any(watch.moved is not None and self.disturbance == watch.moved for watch in self.watches)
+        moved = [watch.moved for watch in self.watches]
+        moved += [self.tracked.tracker.pushed] if self.tracked is not None else []
+        return any(one is not None and self.disturbance == one for one in moved)
 
     def _retreat(self) -> None:
         """Go back along its path, by the last joint readings of the run."""

@@ -1,6 +1,6 @@
 """One connection to a robot for several runs: opened by the first, at rest and closed at the end of all."""
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from contextlib import ExitStack
 from types import TracebackType
 from typing import Self
@@ -19,6 +19,8 @@ class Session:
     ``robot``: that was opened, None before. ``steered``: its set-points. ``acted``: values that actions of it
     were sent last, by their names. ``at``: the watch over the object at whose goal the arm is, None
     elsewhere. ``held``: names of objects that the tool took with an action, by the name of the action.
+    ``followed``: the object at whose goal the arm is while it moves, and what lets the arm go on following it
+    for a time, s; None without one.
     """
 
     def __init__(self) -> None:
@@ -27,6 +29,7 @@ class Session:
         self.acted: dict[str, float] = {}
         self.at: ObjectWatch | None = None
         self.held: dict[str, str] = {}
+        self.followed: tuple[str, Callable[[float], None]] | None = None
         self._stack = ExitStack()
 
     def __enter__(self) -> Self:
@@ -56,15 +59,18 @@ class Session:
 
         The first action at the goal of an object takes it, the next of its name lets go of it.
         """
-        takes = None if name in self.held else self.at
-        if takes is not None and self.steered is not None:
-            _require_there(takes, self.steered)
+        takes = None
+        if name not in self.held and self.followed is not None:
+            takes = self.followed[0]
+        elif name not in self.held and self.at is not None and self.steered is not None:
+            _require_there(self.at, self.steered)
+            takes = self.at.name
         seconds = 0.0 if self.robot is None else self.robot.act(name, value)
         self.acted[name] = value
         self.hold(seconds)
         self.held.pop(name, None)
         if takes is not None:
-            self.held[name], self.at = takes.name, None
+            self.held[name], self.at, self.followed = takes, None, None
         if (lost := self.lost) is not None:
             raise failed([lost])
         return seconds
@@ -83,8 +89,11 @@ class Session:
         return None
 
     def hold(self, seconds: float) -> None:
-        """Hold the set-point for a time, s."""
+        """Hold the set-point for a time, s, or go on following an object that moves."""
         if self.robot is None or self.steered is None:
+            return
+        if self.followed is not None:
+            self.followed[1](seconds)
             return
         end = self.robot.now() + seconds
         self.steered.observe()

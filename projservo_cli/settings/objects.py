@@ -4,20 +4,30 @@ from collections.abc import Iterator, Mapping
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import ConfigDict, Discriminator, Field
+from pydantic import ConfigDict, Discriminator, Field, StrictBool
 from pydantic import Tag as Kind
 from scipy.spatial.transform import Rotation
 
 from projservo_cli.geometry.displacements import rigid
-from projservo_cli.records import CORNERS, FloatArray
+from projservo_cli.records import CORNERS, MM, FloatArray
 from projservo_cli.settings.features import is_name
 from projservo_cli.settings.markers import Tag
-from projservo_cli.settings.sections import Note, OneOf, Positive, Section, Vector3, Whole
+from projservo_cli.settings.sections import (
+    Note,
+    NotNegative,
+    Number,
+    OneOf,
+    Positive,
+    Section,
+    Vector3,
+    Whole,
+)
 
 WORLD_AND_TOOL = ("scene", "tool")
 """Carriers of features besides objects; objects cannot have these names."""
 _MOST = Field(max_length=250)  # tags
 _LEAST = 3  # markers that show how an object is turned
+_ENDLESS_S = 1e6  # longer than any run, s
 
 
 _NUMBERS, _PLACED = "tuple[int]", "tuple[Tag]"  # as pydantic calls kinds of lists, which messages leave out
@@ -54,8 +64,18 @@ class Displacement(Section):
         return rigid(R, middle - R.apply(middle) + self.translation_m)
 
 
+class Velocity(Section):
+    """A steady motion of an object, in the base frame."""
+
+    translation_mm_s: Vector3 = Field((0.0, 0.0, 0.0), description="of the middle of its markers")
+    rotation_deg_s: Vector3 = Field((0.0, 0.0, 0.0), description="about that middle")
+
+
+_Row = tuple[Number, Number, Number, Number, Number, Number, Number]
+
+
 class ObjectSettings(OneOf):
-    """Markers of an object, and where it is in a simulation."""
+    """Markers of an object, whether it is followed, and where it is in a simulation."""
 
     one_of = ("tags", "markers")
     tags: _Tags | None = Field(
@@ -70,6 +90,45 @@ class ObjectSettings(OneOf):
     displacement: Displacement = Field(
         Displacement(), description="in a simulation: how it has moved since the goal was taught"
     )
+    follow: StrictBool = Field(
+        False,
+        description="whether a goal on it is carried along while a law runs, so that the object may move: "
+        "a belt, a turntable",
+    )
+    acceleration: Positive = Field(
+        100.0,
+        description="expected changes of its velocity, standard deviation after 1 s: mm/s² if a length on "
+        "the tool is known, otherwise px/s²",
+    )
+    max_acceleration: Positive = Field(
+        2000.0, description="acceleration, likewise, beyond which it was pushed or taken, so that a run ends"
+    )
+    max_speed_mm_s: Positive | None = Field(
+        None,
+        description="speed of the object, px/s if no length is known, beyond which a run ends as too fast; "
+        "null: any",
+    )
+    lost_s: NotNegative = Field(
+        0.5, description="time for which its motion is predicted while no camera shows it"
+    )
+    approach_mm: NotNegative = Field(
+        0.0, description="distance of the tool from the goal within which its motion is not predicted"
+    )
+    velocity: Velocity | None = Field(None, description="in a simulation: its velocity from the start on")
+    path: Annotated[tuple[_Row, ...], Field(min_length=2)] | None = Field(
+        None,
+        description="in a simulation, instead of velocity: rows t_s, x_mm, y_mm, z_mm, rx_deg, ry_deg, "
+        "rz_deg of its displacement since the start, in the base frame, straight in between",
+    )
+
+    @property
+    def motion(self) -> FloatArray | None:
+        """Rows (k, 7) of a time, s, and its displacement since the start, m and rad; None if it rests."""
+        units = np.array([1.0, *[1.0 / MM] * 3, *[np.radians(1.0)] * 3])
+        if (steady := self.velocity) is not None:
+            each_s = np.array([1.0, *steady.translation_mm_s, *steady.rotation_deg_s])
+            return np.asarray(np.stack([0.0 * each_s, _ENDLESS_S * each_s]) * units)
+        return None if self.path is None else np.asarray(np.array(self.path) * units)
 
     @property
     def placed(self) -> tuple[Tag, ...]:
@@ -117,6 +176,17 @@ class ObjectSettings(OneOf):
             yield (self.kind,), what
         elif self.positions_m is not None and len(self.positions_m) != len(self.numbers):
             yield ("positions_m",), f"{len(self.positions_m)} positions_m for {len(self.numbers)} markers"
+        yield from self._of_motion()
+
+    def _of_motion(self) -> Iterator[Note]:
+        """Yield a motion of an object that is nowhere, one given twice, and times that do not grow."""
+        if moves := self.given("velocity", "path"):
+            if not self.is_placed:
+                yield (moves[0],), "moves an object of a simulation: give size_m and pose of its tags"
+            if len(moves) > 1:
+                yield ("path",), "gives its motion as velocity does: leave one out"
+        if self.path is not None and (np.diff([row[0] for row in self.path]) <= 0.0).any():
+            yield ("path",), "its times must grow from row to row"
 
 
 class Objects(Section):

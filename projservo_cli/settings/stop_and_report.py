@@ -30,6 +30,9 @@ class Stop(Section):
         description="force on the tool, N, beyond which a run stops; asks force() of the robot class, and "
         "the contacts of plant mujoco; null: any",
     )
+    follow_s: Positive = Field(
+        2.0, description="time for which a goal that moves must be followed, from the first arrival on"
+    )
     innovation_threshold: NotNegative = Field(
         1.0,
         description="fault detection: a fault is an innovation beyond chance and beyond this factor × "

@@ -15,10 +15,11 @@ from projservo_cli.image_size import image_sizes
 from projservo_cli.records import TOOL, FloatArray, no_lenses, position_limits, prismatic_of
 from projservo_cli.result_hashes import File
 from projservo_cli.settings.markers import Markers, Tag
+from projservo_cli.settings.objects import ObjectSettings
 from projservo_cli.settings.plant import RenderedOptions
 from projservo_cli.settings.robot_and_rig import Camera, Rig, RobotSettings, Screws
 from projservo_cli.simulation.arm import Link, SerialArm, dh_twists
-from projservo_cli.simulation.ground_truth import Truth
+from projservo_cli.simulation.ground_truth import SceneObject, Truth
 from projservo_cli.simulation.random_streams import NoiseShape
 from projservo_cli.simulation.rendering import RenderedScene, lens_of
 from projservo_cli.task.face import MIDPOINT
@@ -127,10 +128,12 @@ def described_scene(
     options: RenderedOptions,
     mjcf: File | None,
     objects: tuple[Tag, ...] = (),
+    moving: tuple[tuple[str, ObjectSettings], ...] = (),
 ) -> RenderedScene:
     """Return the scene before rendered cameras.
 
-    mjcf : the model of the arm, None for capsules; objects : tags of objects at their places.
+    mjcf : the model of the arm, None for capsules; objects : tags of objects at their places; moving :
+        the objects that move.
     """
     further = [number for tag in objects for number in tag.numbers]
     return RenderedScene(
@@ -146,4 +149,11 @@ def described_scene(
         view=tuple(rig.cameras),
         on_tool=rig.mount == TOOL,
         objects=objects,
+        moving=tuple(scene_object(*one) for one in moving),
     )
+
+
+def scene_object(name: str, one: ObjectSettings) -> SceneObject:
+    """Return an object whose places in the scene are given."""
+    assert one.points is not None
+    return SceneObject(name, one.numbers, one.points, one.normals, one.moved, one.motion)

@@ -183,6 +183,16 @@ class SceneObject(NamedTuple):
     X: FloatArray  # (k, 4) these when the goal was taught, in the base frame, m
     normals: FloatArray  # (k, 3) directions that they looked in; zero if they are seen from anywhere
     T: FloatArray  # (4, 4) displacement since
+    # rows (k, 7) of t, s, x, y, z, m, and a rotation vector, rad, from then on; None if it rests
+    motion: FloatArray | None = None
+
+    def at(self, time: float) -> FloatArray:
+        """Return its displacement (4, 4) since the goal was taught, at a time of the robot's clock, s."""
+        if self.motion is None:
+            return self.T
+        x = [np.interp(time, self.motion[:, 0], column) for column in self.motion.T[1:]]
+        middle, R = (self.X @ self.T.T)[:, :3].mean(axis=0), Rotation.from_rotvec(x[3:])
+        return rigid(R, middle - R.apply(middle) + x[:3]) @ self.T
 
     def displaced(self, by: Displacement) -> "SceneObject":
         """Return the object after another displacement about where its middle is."""

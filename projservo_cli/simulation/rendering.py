@@ -19,6 +19,7 @@ from projservo_cli.result_hashes import File
 from projservo_cli.settings.markers import Tag
 from projservo_cli.settings.plant import RenderedOptions
 from projservo_cli.simulation.arm import SerialArm, roll_axis
+from projservo_cli.simulation.ground_truth import SceneObject
 from projservo_cli.simulation.mjcf import chain_of, compiled, mujoco, no_gl, spec_of, tip_of
 
 # Thickness of the first link of an arm and of the last, in lengths of the arm, and of none in any.
@@ -27,6 +28,7 @@ _THICK, _THIN, _LEAST_LINK_M = 0.05, 0.03, 1e-3
 _LINK, _HOLDER = (0.75, 0.5, 0.25, 1.0), (0.3, 0.3, 0.3, 1.0)
 _PLATE_M, _ROD_M = 5e-4, 4e-3  # half the thickness of a tag, and of the rod that holds it
 _TOOL_DENSITY = 500.0  # kg/m³
+_SCENE_TAGS = "scene with tags"  # name of the body of tags in the scene
 _SIDES = ("front", "back")  # sides of a plate: the tag, and its opaque back
 # Picture of a tag: where it has more pixels than the frame, edges along its rows are drawn a tenth of
 # a pixel off.
@@ -39,6 +41,7 @@ _NEAR_M, _FAR_M = 0.01, 50.0  # range of cameras
 _WALL, _WALL_M = "far wall", 40.0  # background, and its distance
 _FINER = 2
 """Pixels of a drawing along each of a frame: of one alone, edges are drawn up to a tenth of a pixel off."""
+_AT_OPENING = np.zeros(1)
 _STILL = 1e-5  # rad or m: smaller motions in an exposure cause no blur
 
 
@@ -57,7 +60,8 @@ class RenderedScene:
     options: RenderedOptions
     view: tuple[str, ...] = VIEWS  # names of the views
     on_tool: bool = False  # whether the cameras are on the tool, and the tags are fixed in the base frame
-    objects: tuple[Tag, ...] = ()  # further tags, fixed in the base frame
+    objects: tuple[Tag, ...] = ()  # further tags, in the base frame
+    moving: tuple[SceneObject, ...] = ()  # objects with some of these that move, which are there at time 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +76,7 @@ class RenderedModel:
     plates: tuple[tuple[int, ...], ...]  # for each tag the geoms that are its plate
     margin: int  # widening of drawings at each side, px
     tool: FloatArray  # (3, 3) rotation of the frame of the tags in the frame of the body that holds them
+    moving: tuple[int, ...] = ()  # bodies of the objects that move
 
     @property
     def positions(self) -> IntArray:
@@ -131,8 +136,8 @@ def rendered_model(scene: RenderedScene) -> RenderedModel:
     # Tags and cameras: one on the tool, the other in the base frame.
     body, place = (spec.worldbody, np.eye(4)) if scene.on_tool else (tip, tool)
     _add_tags(body, spec, place, scene.tags, finder, in_scene=scene.on_tool)
-    if scene.objects:
-        _add_tags(spec.worldbody, spec, np.eye(4), scene.objects, finder, in_scene=True)
+    for name, tags in _objects_of(scene):
+        _add_tags(spec.worldbody, spec, np.eye(4), tags, finder, in_scene=True, name=name)
     at_reference = np.linalg.inv(scene.arm.base_tool) if scene.on_tool else np.eye(4)
     _put_light(spec, scene.options.light, P @ at_reference)
     K, R, t = (np.array(parts) for parts in zip(*map(_decomposed, P), strict=True))
@@ -156,7 +161,18 @@ def rendered_model(scene: RenderedScene) -> RenderedModel:
         plates=plates,
         margin=margin,
         tool=place[:3, :3],
+        moving=tuple(model.body(_SCENE_TAGS + one.name).id for one in scene.moving),
     )
+
+
+def _objects_of(scene: RenderedScene) -> list[tuple[str, list[Tag]]]:
+    """Tags of the objects that rest, which are one body, and of each that moves, with its name."""
+    owner = {number: one.name for one in scene.moving for number in one.number}
+    names = [owner.get(tag.numbers[0], "") for tag in scene.objects]
+    return [
+        (name, [tag for tag, of in zip(scene.objects, names, strict=True) if of == name])
+        for name in dict.fromkeys(names)
+    ]
 
 
 def _add_arm(spec: Any, arm: SerialArm) -> None:
@@ -206,14 +222,22 @@ def _name(tag: Tag, side: str) -> str:
 
 
 def _add_tags(
-    holder: Any, spec: Any, tool: FloatArray, tags: Sequence[Tag], finder: TagFinder, *, in_scene: bool
+    holder: Any,
+    spec: Any,
+    tool: FloatArray,
+    tags: Sequence[Tag],
+    finder: TagFinder,
+    *,
+    in_scene: bool,
+    name: str = "",
 ) -> None:
     """Hang tags on a body of a specification.
 
     tool : (4, 4) pose of their frame in its own, m; in_scene : whether that is the frame of the base.
     """
     mj = mujoco()
-    body, origin = holder.add_body(name="scene with tags" if in_scene else "tool with tags"), tool[:3, 3]
+    body = holder.add_body(name=_SCENE_TAGS + name if in_scene else "tool with tags")
+    origin = tool[:3, 3]
     if in_scene:  # rods meet behind the tags
         origin = np.mean([np.array(tag.pose)[:3, 3] - tag.size_m * tag.normal for tag in tags], 0)
     if not any(material.name == "tag holder" for material in spec.materials):
@@ -373,16 +397,22 @@ class Frames:
             self._renderer = None
 
     def capture(
-        self, view: int, q: FloatArray, moved: tuple[int, FloatArray] | None, rng: np.random.Generator
+        self,
+        view: int,
+        q: FloatArray,
+        moved: tuple[int, FloatArray] | None,
+        rng: np.random.Generator,
+        times: FloatArray = _AT_OPENING,
     ) -> tuple[FloatArray, FloatArray]:
         """Pixels (m, 2) that are found in a frame, NaN where unseen, and their deviations (m,), px.
 
-        q : (k, n) joints at instants of its exposure, rad or m.
+        q : (k, n) joints at instants of its exposure, rad or m; times : these (k,), s.
         moved : number of a marker whose tag was moved, and by how much in the frame of the tool, (3,) m.
         """
         self._move(moved)
-        still = np.abs(q - q[len(q) // 2]).max() < _STILL
-        shots = [self._drawn(view, joints) for joints in (q[len(q) // 2 :][:1] if still else q)]
+        still = np.abs(q - q[len(q) // 2]).max() < _STILL and not self.rendered.moving
+        instants = list(zip(q, times.tolist(), strict=True))
+        shots = [self._drawn(view, *at) for at in (instants[len(q) // 2 :][:1] if still else instants)]
         image = np.mean(shots, axis=0, dtype=np.float32)
         cv = self._finder.cv
         if self._scene.options.blur_px > 0.0:
@@ -403,9 +433,13 @@ class Frames:
                     pixels[place], sigma[place] = tag.pixels[k], tag.sigma[k]
         return pixels, sigma
 
-    def _drawn(self, view: int, q: FloatArray) -> ByteArray:
+    def _drawn(self, view: int, q: FloatArray, time: float) -> ByteArray:
         """Return the grey values (height, width) of a camera at joints (n,), without blur and noise."""
         mj = mujoco()
+        for body, one in zip(self.rendered.moving, self._scene.moving, strict=True):
+            T = one.at(time) @ np.linalg.inv(one.T)
+            self._model.body_pos[body] = T[:3, 3]
+            self._model.body_quat[body] = Rotation.from_matrix(T[:3, :3]).as_quat(scalar_first=True)
         self._data.qpos[self.rendered.positions] = q
         mj.mj_kinematics(self._model, self._data)
         mj.mj_camlight(self._model, self._data)

@@ -8,7 +8,7 @@ Rolling shutters are not modelled.
 
 import bisect
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import lru_cache
 from typing import Any, NamedTuple, Protocol
 
@@ -31,6 +31,7 @@ _EXPOSED = 5  # instants of an exposure that are averaged
 _POSTURES = 500  # that are drawn to see how far an arm reaches
 _BEFORE = 2**20  # frames before the opening are numbered too
 _CLOCKS_S = 100.0  # maximum offset of clocks of cameras
+_AT_OPENING = np.zeros(1)
 
 
 class SimulatedRobot(NamedTuple):
@@ -57,11 +58,17 @@ class _Eyes(Protocol):
         """Release the cameras."""
 
     def capture(
-        self, view: int, q: FloatArray, moved: tuple[int, FloatArray] | None, rng: np.random.Generator
+        self,
+        view: int,
+        q: FloatArray,
+        moved: tuple[int, FloatArray] | None,
+        rng: np.random.Generator,
+        times: FloatArray = ...,
     ) -> tuple[FloatArray, FloatArray | None]:
         """Pixels (m, 2) in a frame of a view, NaN where unseen, and their deviations (m,), px, if known.
 
-        q : (k, n) joints at instants of its exposure, rad or m.
+        q : (k, n) joints at instants of its exposure, rad or m; times : these (k,), s; at the opening by
+            default.
         moved : number of a marker that was moved, and by how much in the frame of the tool, (3,) m.
         """
 
@@ -74,7 +81,7 @@ class Points(NamedTuple):
     see: Callable[[FloatArray, FloatArray], FloatArray]
     borders: bool
     sigma_px: float  # noise of a coordinate of each frame
-    fixed_pixels: FloatArray = np.zeros((1, 0, 2))  # (V, k, 2) px of the markers of objects; NaN where unseen
+    objects: tuple[SceneObject, ...] = ()  # that they see, too
 
     def open(self) -> None:
         """Nothing is to be opened."""
@@ -83,7 +90,12 @@ class Points(NamedTuple):
         """Nothing is left open."""
 
     def capture(
-        self, view: int, q: FloatArray, moved: tuple[int, FloatArray] | None, rng: np.random.Generator
+        self,
+        view: int,
+        q: FloatArray,
+        moved: tuple[int, FloatArray] | None,
+        rng: np.random.Generator,
+        times: FloatArray = _AT_OPENING,
     ) -> tuple[FloatArray, FloatArray | None]:
         """As of all cameras."""
         M = self.truth.M
@@ -94,8 +106,10 @@ class Points(NamedTuple):
             )
             M[self.truth.number.index(moved[0]), :3] += by
         mean_pixels = np.mean([self.see(joints, M)[view] for joints in q], axis=0)
-        if self.fixed_pixels.size:
-            mean_pixels = np.concatenate([mean_pixels, self.fixed_pixels[view]])
+        for one in self.objects:
+            at = times if one.motion is not None else times[:1]
+            of_object = [one.images(self.truth, one.at(float(time)))[view] for time in at]
+            mean_pixels = np.concatenate([mean_pixels, np.mean(of_object, axis=0)])
         return np.asarray(mean_pixels + self.sigma_px * self.truth.noise.draw(rng, mean_pixels.shape)), None
 
 
@@ -159,20 +173,14 @@ def robot_of(
     truth, faults, scene, period, objects = robot
     if scene is None:
         later, moved = None, events.object_moved
-        if objects:
-            points = points._replace(fixed_pixels=_images_of(objects, truth))
+        points = points._replace(objects=objects)
         if moved is not None:
             after = [one.displaced(moved) if one.name == moved.name else one for one in objects]
-            later = points._replace(fixed_pixels=_images_of(after, truth))
+            later = points._replace(objects=tuple(after))
         return FaultyRobot(World(truth, q_start, points, period, *drawn, eyes_later=later), faults, events)
     rendered = rendered_model(scene)
     servos = Physics(rendered, q_start, faults.servo_time_constant_s, math.radians(faults.gravity_sag_deg))
     return FaultyRobot(World(truth, q_start, Frames(rendered), period, *drawn, servos), faults, events)
-
-
-def _images_of(objects: Sequence[SceneObject], truth: Truth) -> FloatArray:
-    """Pixels (V, k, 2) of the markers of objects, NaN where unseen."""
-    return np.concatenate([one.images(truth, one.T) for one in objects], axis=1)
 
 
 def observed_in_frames(
@@ -475,7 +483,7 @@ class _Camera:
         eyes = world.eyes
         if (shifted := events.object_moved) is not None and step >= shifted.at_step:
             eyes = world.eyes_later or eyes
-        pixels, sigma = eyes.capture(self._view, q, moved, rng)
+        pixels, sigma = eyes.capture(self._view, q, moved, rng, times)
         if (knocked := events.camera_moved) is not None and step >= knocked.at_step:
             pixels += knocked.shift_of(truth.view[self._view])
         if (lost := events.lost_markers) is not None and _lasts(lost, step):

@@ -17,7 +17,7 @@ from projservo_cli.settings.control import LawSettings, SpeedLimits
 from projservo_cli.settings.disturbance import EachView, Events
 from projservo_cli.settings.markers import Markers
 from projservo_cli.settings.noise_and_data import LoopNoise
-from projservo_cli.settings.objects import Objects
+from projservo_cli.settings.objects import Objects, ObjectSettings
 from projservo_cli.settings.plant import Rest, RunConditions, ServoLimits
 from projservo_cli.settings.robot_and_rig import LimitSettings
 from projservo_cli.settings.sections import JointVector
@@ -377,9 +377,14 @@ class CarryingObject:
     lengths: KnownLengths
 
     @property
+    def settings(self) -> ObjectSettings:
+        """Its section of the configuration."""
+        return self.objects.named[self.name]
+
+    @property
     def numbers(self) -> tuple[int, ...]:
         """Numbers of its markers."""
-        return self.objects.named[self.name].numbers
+        return self.settings.numbers
 
 
 @dataclass(frozen=True, eq=False)

@@ -318,8 +318,21 @@ def images_by_motion(c: Calibration, s: FloatArray) -> FloatArray:
     return found
 
 
+class Displaced(NamedTuple):
+    """Displacement T B of an object since a goal was taught on it, in the frame of looks, with its errors.
+
+    They are steps T exp(ξ E), by independent errors of unit variance.
+    """
+
+    T: FloatArray  # (4, 4)
+    B: FloatArray  # (4, 4) to the frame of E
+    E: FloatArray  # (g, 4, 4) generators
+    by_images: FloatArray  # (g, N)
+    by_calibration: FloatArray  # (g, c)
+
+
 @dataclass(frozen=True, eq=False)
-class _CarriedGoal:
+class CarriedGoal:
     """Goal of the tool after the displacement of the object that it was taught on, with its errors."""
 
     s: FloatArray  # (V, m, 2) px of the markers of the tool, in the order of the calibration
@@ -364,7 +377,7 @@ class DisplacedObject:
     noise_factor: float  # residuals over their deviation, rms per degree of freedom
     unit_mm: float  # mm in a unit of the frame that it was found in; NaN without a known length
     left_out: tuple[int, ...]  # numbers of markers that were outliers in a frame, and left out of it
-    _rig: ObjectViewRig
+    rig: ObjectViewRig
     _fit: BundleFit
 
     @property
@@ -410,30 +423,30 @@ class DisplacedObject:
             noise_factor=float(np.sqrt(fit.cost / max(len(r) - J.shape[1], 1))),
             unit_mm=float(unit),
             left_out=left_out,
-            _rig=rig,
+            rig=rig,
             _fit=fit,
         )
 
-    def markers_now(self, numbers: Sequence[int]) -> UncertainPoints:
-        """Return some of its markers (k,) where they are now, NaN where unseen, in the frame of the looks."""
-        found = self._fit.points_at(len(self._fit.T) - 1, self._rig)
+    def markers(self, numbers: Sequence[int], look: int = -1) -> UncertainPoints:
+        """Return some of its markers (k,) at a look, NaN where unseen, in the frame of the looks."""
+        found = self._fit.points_at(range(len(self._fit.T))[look], self.rig)
         at = [self.marker.index(number) if number in self.marker else -1 for number in numbers]
         unseen = np.array(at) < 0
         return UncertainPoints(
             *(np.where(unseen[:, None], np.nan, found.X[at]), found.by_images[at], found.by_calibration[at])
         )
 
-    def carry(self, goal: ObjectView | FloatArray) -> _CarriedGoal:
+    def carry(self, goal: ObjectView | FloatArray, at: Displaced | None = None) -> CarriedGoal:
         """Carry a goal of the tool along that was taught in the first frame.
 
         goal : images (V, m, 2) of the markers of the tool there, px, in the order of the calibration; NaN
             where unseen.
+        at : where the object is; None for the last look.
         Raises WorkFailed if they do not determine a pose of the tool, or the carried one is out of sight.
         """
-        rig, fit = self._rig, self._fit
+        rig, at = self.rig, self._now() if at is None else at
         tool = _tool_at(rig, goal if isinstance(goal, ObjectView) else ObjectView(goal))
-        to_taught = np.linalg.inv(fit.T[0])
-        H = fit.T[-1] @ to_taught @ tool.T[0]
+        H = at.T @ at.B @ tool.T[0]
         placed = tool.X @ H.T
         if not (placed @ rig.P[0, :, 2].T > 0.0).all():
             raise unknown(Finding("carried_behind", REFUSES))
@@ -447,22 +460,23 @@ class DisplacedObject:
             motion = out._replace(E=E).by_motion(by_point, points[None], T[None, None])
             return np.asarray(motion.reshape(s.size, -1))
 
-        carried = tool.X @ (to_taught @ tool.T[0]).T
-        by_goal, by_now = by(tool.bundle.E, tool.X, H), by(fit.bundle.E, carried, fit.T[-1])
-        (xi, xi_c), (goal_s, goal_c) = self._errors(), tool.errors(rig, rig.M)
+        carried = tool.X @ (at.B @ tool.T[0]).T
+        by_goal, by_now = by(tool.bundle.E, tool.X, H), by(at.E, carried, at.T)
+        xi, xi_c = at.by_images, at.by_calibration
+        goal_s, goal_c = tool.errors(rig, rig.M)
         of_calibration = changes_of(rig.pixels(rig.M @ H.T)).reshape(-1, s.size).T
         of_calibration += by_now @ xi_c + by_goal @ goal_c
 
         def images(T: FloatArray) -> FloatArray:
             """Images (K, V m 2) after small displacements (K, 4, 4) of the object."""
             exact = rig._replace(P=rig.P[:1], lens=rig.lens[:1])
-            return exact.pixels(carried @ (fit.T[-1] @ T).swapaxes(1, 2)).reshape(len(T), -1)
+            return exact.pixels(carried @ (at.T @ T).swapaxes(1, 2)).reshape(len(T), -1)
 
-        second = _second_order(images, fit.bundle.E, np.hstack([xi, xi_c]))
+        second = _second_order(images, at.E, np.hstack([xi, xi_c]))
         changes = np.concatenate([by_now @ xi, by_goal @ goal_s, of_calibration, second], axis=1)
         pose = by(generators(rig.turns, placed[:, :3].mean(axis=0)), placed, np.eye(4))
         pose_changes = np.linalg.pinv(pose) @ changes
-        return _CarriedGoal(
+        return CarriedGoal(
             s=s,
             changes=changes.T.reshape(-1, *s.shape),
             H=np.linalg.inv(rig.G) @ H @ rig.G,
@@ -471,16 +485,16 @@ class DisplacedObject:
             unit_mm=self.unit_mm,
         )
 
-    def _errors(self) -> tuple[FloatArray, FloatArray]:
-        """Errors of the displacement of the object (g, N) by its images, and (g, c) by the calibration."""
+    def _now(self) -> Displaced:
+        """Displacement to the last look, with its errors."""
         fit = self._fit
-        by_images, by_calibration = fit.errors(self._rig, fit.X)
+        by_images, by_calibration = fit.errors(self.rig, fit.X)
         xi, xi_c = np.zeros((2, len(fit.bundle.E), 1))
         for at_frame, sign in ((0, -1.0), (len(fit.T) - 1, 1.0)):
             if at_frame != fit.bundle.fixed:
                 own = fit.bundle.columns(at_frame, len(fit.X))
                 xi, xi_c = xi + sign * by_images[own], xi_c + sign * by_calibration[own]
-        return xi, xi_c
+        return Displaced(fit.T[-1], np.linalg.inv(fit.T[0]), fit.bundle.E, xi, xi_c)
 
 
 def _second_order(

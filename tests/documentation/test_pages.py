@@ -36,6 +36,7 @@ DRIVING = {
     "choose-your-rig",
     "commands",
     "first-law",
+    "follow-a-belt",
     "first-run",
     "planning",
     "python",

@@ -261,3 +261,16 @@ class Wrong(ByImage):
 class Raising(ByImage):
     def __call__(self, s, q):
         return [][0]
+
+
+class Carrying(Taking):
+    """Its part is on a belt that runs at 30 mm/s while time passes."""
+
+    def read(self):
+        belt = np.eye(4)
+        belt[1, 3] = 0.03 * self.time
+        self.shift = belt @ Seeing.shift
+        return super().read()
+
+    def holding(self, name):
+        return True

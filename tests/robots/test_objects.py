@@ -10,6 +10,7 @@ import pytest
 
 from projservo_cli import cli
 from projservo_cli.config import load_config
+from projservo_cli.settings.objects import Displacement
 from projservo_cli.store.run_file import load
 from tests.robots.robots import CALLS, Seeing, Sound
 
@@ -167,3 +168,35 @@ def test_an_object_that_is_not_seen_or_another_or_moved_is_refused_before_anythi
     assert answer.code == 1
     assert re.search(message, " ".join(answer.err.split())), answer.err
     assert not [sent for sent in CALLS if isinstance(sent, tuple)]
+
+
+def test_a_part_on_a_belt_is_followed_until_the_gripper_has_it(call, taught):
+    """The arm goes along while the gripper closes, and then away with the part, which nobody watches."""
+    near = PART.model_copy(update={"displacement": Displacement(translation_m=(0.0, -0.08, 0.0))})
+    step = {"along": "plate", "by_m": 0.03}
+    steps = [
+        {"approach": step | {"to": "goal"}},
+        {"to": "goal"},
+        {"act": {"gripper": 0.0}},
+        {"retreat": step},
+    ]
+    features = {"plate": {"on": "tool", "plane": [0, 1, 2]}}
+    asked = [f"--set=task.steps={json.dumps(steps)}", f"--set=features={json.dumps(features)}"]
+    asked += [f"--set=control.gain_{name}=8" for name in "trps"]
+    asked += ["--set=objects.part.follow=true", "--json"]
+    plant = PLANT.replace("Seeing", "Carrying").replace("use:", "time_offset_s: 0, use:")
+    answer = call("servo", "--law", "exact", *asked, plant=plant, shift=near.moved)
+    assert answer.code == 0, answer.err
+    verdicts = [one["verdict"] for one in answer.json["steps"]]
+    assert verdicts == ["followed", "followed", "done", "converged"]
+    following = answer.json["laws"][1]["following"]
+    assert following["speed_mm_s"] == pytest.approx(30.0, abs=1.0)
+    assert following["max_mm"] < 2.0
+    sent = [one for one in CALLS if not isinstance(one, str) or one.startswith("gripper")]
+    closes = sent.index("gripper 0")
+    during = sum(one.step for one in sent[closes + 1 : closes + 11])
+    before = sum(one.step for one in sent[closes - 10 : closes])
+    np.testing.assert_allclose(during, before, atol=6e-3)  # 0.4 s of the belt, 12 mm
+    _, there, after = load(taught / "run").traces.values()
+    assert there.of_goal.goal_error_mm[-1] < 2.0
+    assert after.of_goal is None

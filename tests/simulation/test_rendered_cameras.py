@@ -1,6 +1,7 @@
 """What rendered cameras show, against the projection of the true corners."""
 
 import hashlib
+import json
 import os
 import subprocess
 import sys
@@ -9,7 +10,10 @@ import numpy as np
 import pytest
 
 from projservo_cli.config import to_yaml
+from projservo_cli.config.inputs import objects_of, scene_of
 from projservo_cli.records import InputError
+from projservo_cli.simulation.rendering import Frames, rendered_model
+from tests.configured import truth_of
 from tests.simulation.conftest import eyes_of
 
 POSTURES = np.array([[0.1 * a, 0.25 * b] for a in (-2, 0, 1, 3) for b in (-1, 0, 1)])
@@ -113,3 +117,24 @@ def test_a_scene_that_cannot_be_is_said_in_a_line(small, overrides, message):
     config = small(*(text.replace("TAG", tag) for text in overrides))
     with pytest.raises(InputError, match=message):
         eyes_of(config)
+
+
+def test_an_object_moves_before_the_cameras(small, needs_mujoco):
+    """A tag that goes along and turns is found where the cameras project it then."""
+    pose = [[0, 0, 1, 0.5], [1, 0, 0, 0.2], [0, 1, 0, 0.2], [0, 0, 0, 1]]
+    tag = {"number": 20, "size_m": 0.1, "pose": pose}
+    velocity = {"translation_mm_s": [0.0, 30.0, 10.0], "rotation_deg_s": [10.0, 0.0, 0.0]}
+    config = small(f"objects.part.tags={json.dumps([tag])}", f"objects.part.velocity={json.dumps(velocity)}")
+    (one,), truth = objects_of(config), truth_of(config)
+    eyes = Frames(rendered_model(scene_of(config, None, config.objects.named)))
+    eyes.open()
+    found = 0
+    for time in (0.0, 1.0, 2.0):
+        s, at = one.images(truth, one.at(time)), np.array([time])
+        for view in range(2):
+            seen, _ = eyes.capture(view, np.array([[0.1, 0.2]]), None, np.random.default_rng(0), at)
+            off = seen[-4:] - s[view]
+            found += np.isfinite(off[:, 0]).sum()
+            assert (np.abs(off[np.isfinite(off)]) < 0.2).all()
+    eyes.close()
+    assert found > 12  # of 24 corners

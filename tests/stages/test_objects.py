@@ -94,6 +94,15 @@ def test_incidences_on_an_object_are_met_where_it_is_now():
     assert trace.position_error_mm < 3.0 * planned.goal_deviation_mm
 
 
+def test_the_law_of_incidences_drives_a_carried_pose_to_where_it_is():
+    near = {"translation_m": [-0.02, -0.08, 0.0], "rotation_deg": [4.0, 5.0, 6.0]}
+    config = configured("object", "control.mode=[regulate]", f"objects.part.displacement={json.dumps(near)}")
+    planned = plan.run(config, calibrated())
+    trace = servo.run(config, calibrated(), planned, "incidences")
+    assert (trace.verdict, trace.success) == ("converged", True)
+    assert trace.position_error_mm < 3.0 * planned.goal_deviation_mm
+
+
 def assert_met(trace, truth, hole, plane):
     """The pin is in a hole (2, 3) and its tip on a plane (3, 3), m, in truth as well as is stated."""
     assert (trace.verdict, trace.success, trace.free_dof) == ("converged", True, 1), trace.reason

@@ -17,6 +17,7 @@ from projservo_cli.findings import Finding
 from projservo_cli.geometry.mechanisms import in_span
 from projservo_cli.laws import CODES, INCIDENCES, REGULATE
 from projservo_cli.loop.compiled_loop import Course, run_compiled
+from projservo_cli.loop.goal_monitor import GoalMonitor
 from projservo_cli.loop.python_loop import BuiltInLaw, LoopLaw, run_in_python
 from projservo_cli.loop.replanning import ExecutionMonitor
 from projservo_cli.loop.run_metrics import Ended, Summary, path_deviation, summarize
@@ -24,11 +25,13 @@ from projservo_cli.loop.stall_monitor import StallMonitor
 from projservo_cli.loop.verdicts import (
     CONVERGED,
     FAULT_DETECTED,
+    MAX_STEPS,
     OBJECT_MOVED,
     VERDICT_NAMES,
     Log,
     new_log,
 )
+from projservo_cli.messages import failed
 from projservo_cli.messages.rows_by_code import Setup
 from projservo_cli.records import (
     MM,
@@ -42,6 +45,7 @@ from projservo_cli.robots.latency_compensation import DrivenRobot
 from projservo_cli.robots.session import Session
 from projservo_cli.simulation.analytic_plant import AnalyticPlant, Ends, Plant
 from projservo_cli.stages.plan_motion import PathReplanner, search_of, why_closed
+from projservo_cli.stages.runs.followed_goal import followed_goal
 from projservo_cli.stages.runs.plugin_law import LawSetup, PluginLaw
 from projservo_cli.stages.runs.robot_with_monitors import connected_robot
 from projservo_cli.stages.scenario import RunScenario
@@ -89,6 +93,7 @@ class LawRun:
     limited: float = 0.0  # how often visibility limited the translation
     plant: Plant = _NOT_DRIVEN  # that was driven; of an external robot the calibrated model
     replannings: tuple[Finding, ...] = ()
+    goal: GoalMonitor | None = None  # of a goal that moves
     driven: DrivenRobot | None = None  # client of a robot of the contract
     unseen: Finding | None = None  # cameras that showed nothing before the run, though they were compared
     noise_ratio: float = 1.0  # stated noise of pixels at the end over the noise of the run; at least 1
@@ -161,14 +166,36 @@ class LawRun:
         shared, plan = self.brought.session, self.plan if isinstance(self.plan, Plan) else None
         # The matrices of a frame are small: a second thread costs more than it gives.
         with threadpool_limits(limits=1), nullcontext(shared) if shared else Session() as session:
-            driven = connected_robot(scenario, self.law, session, self.brought.robot, plan)
+            followed = followed_goal(scenario, self.law, self._images, plan, session)
+            if followed is not None and self.course.mode != REGULATE:
+                raise InputError(f"{self.law} follows objects.{followed.tracked.name} in mode regulate alone")
+            tracked = None if followed is None else followed.tracked
+            driven = connected_robot(scenario, self.law, session, self.brought.robot, plan, tracked)
             driven.stops = shared is None
             self.unseen = scenario.world.begin(
                 driven, contract, scenario.ends.q_start, blind=self.brought.blind
             )
             driven.begin()
             driven.retreats = _RETREAT
-            self.in_python(controller, driven, StallMonitor(driven, scenario.termination))
+            stall: StallMonitor | None = StallMonitor(driven, scenario.termination)
+            if followed is not None and isinstance(controller, BuiltInLaw):
+                limits, stall = scenario.termination, None
+                self.goal = GoalMonitor(controller, followed.goal, driven, limits, followed.limits)
+            self.in_python(controller, driven, stall)
+            if followed is not None and self.verdict == "followed":
+                session.followed = followed.tracked.name, partial(self._go_on, controller, driven)
+
+    def _go_on(self, law: LoopLaw, driven: DrivenRobot, seconds: float) -> None:
+        """Follow the goal for a further time, s; raises WorkFailed if that fails."""
+        scenario, goal = self.scenario, self.goal
+        assert goal is not None
+        period, limits = scenario.gains.period, scenario.termination
+        limits = limits._replace(max_steps=max(1, math.ceil(seconds / period)))
+        goal.goes_on(limits)
+        code, _, _ = run_in_python(law, driven, self.s_star, period, limits, scenario.gains.scale, goal=goal)
+        if code != MAX_STEPS:
+            why = driven.disturbance or goal.reason
+            raise failed([] if why is None else [why], self.setup, begin=f"{VERDICT_NAMES[code]}: ")
 
     def in_python(
         self, law: LoopLaw, plant: AnalyticPlant | DrivenRobot, stall: StallMonitor | None = None
@@ -188,6 +215,7 @@ class LawRun:
             scenario.gains.period,
             scenario.termination,
             scenario.gains.scale,
+            goal=self.goal,
             stall=stall,
             execution=execution,
         )
@@ -206,6 +234,8 @@ class LawRun:
         self.verdict, self.plant = VERDICT_NAMES[code], plant.plant
         self.limited = float(law.state.limited[0]) if isinstance(law, BuiltInLaw) else 0.0
         self.why = plant.disturbance or (None if stall is None else stall.reason)
+        if self.goal is not None:
+            self.why = plant.disturbance or self.goal.reason
         self.replannings = () if execution is None else tuple(execution.attempts)
 
     def _task(self, model: Model, plan: Plan) -> Task:
@@ -226,7 +256,8 @@ class LawRun:
             raise InputError(
                 f"{self.law} measures with the body: leave control.features: points out, and calibrate well"
             )
-        return images.asking(whole_pose(images.body.M[: self.scenario.world.m]))
+        # Its incidences are of the scene, so that the scene is where the goal was carried.
+        return images.to(images.s_star).asking(whole_pose(images.body.M[: self.scenario.world.m]))
 
     def _built_in(self) -> BuiltInLaw:
         """The built-in law with the model that it is given, and the sense of its rotations."""
@@ -271,6 +302,11 @@ class LawRun:
         return self.scenario.world.judged(found)
 
     @property
+    def s_star(self) -> FloatArray:
+        """Images (V, m, 2) of the face at the goal, where it was at the end if it moved, px."""
+        return self.scenario.ends.by_points().s_star if self.goal is None else self.goal.s_star
+
+    @property
     def self_occluded_steps(self) -> tuple[int, ...]:
         """Number of times (V,) at which each camera is behind the face."""
         return tuple(np.count_nonzero(self.log.hidden[: self.steps + 1], axis=0).tolist())
@@ -288,4 +324,9 @@ class LawRun:
     def true_ends(self) -> Ends:
         """True poses of the tool, with the nearest goal to where it ended where incidences leave it open."""
         scenario, H = self.scenario, self.log.H[self.steps]
-        return scenario.world.nearest_ends(scenario.exact, scenario.true_ends, self.plant, H)
+        if self.goal is None or not self.goal.periods:
+            return scenario.world.nearest_ends(scenario.exact, scenario.true_ends, self.plant, H)
+        (T,), _ = scenario.world.true_motion(np.array([self.goal.periods[-1].t]))
+        H = np.linalg.inv(T) @ H
+        found = scenario.world.nearest_ends(scenario.exact, scenario.true_ends, self.plant, H)
+        return found._replace(goal_pose=T @ found.goal_pose, goal=T @ found.goal)

@@ -10,7 +10,7 @@ from projservo_cli.monitoring.image_monitor import ImageMonitor
 from projservo_cli.monitoring.innovation_tests import WINDOW
 from projservo_cli.records import Calibration, Plan
 from projservo_cli.robots.contract import Robot
-from projservo_cli.robots.latency_compensation import DrivenRobot, Known
+from projservo_cli.robots.latency_compensation import DrivenRobot, Known, Tracked
 from projservo_cli.robots.latency_estimation import DelayPrior
 from projservo_cli.robots.object_watch import ObjectWatch
 from projservo_cli.robots.session import Session
@@ -25,12 +25,13 @@ def connected_robot(
     session: Session,
     given: Robot | None = None,
     plan: Plan | None = None,
+    tracked: Tracked | None = None,
 ) -> DrivenRobot:
     """Return the robot, open, as the loop of a law sees it: with its truth, or with the calibrated model.
 
     session : which it is opened in, unless it is.
     given : an object of the contract instead of one of a class.
-    plan : of which the objects that carry its goal are watched.
+    plan : of which the objects that carry its goal are watched, all but the tracked one.
     """
     contract, world, plant = scenario.servo.contract, scenario.world, scenario.plant_of(law)
     assert contract is not None
@@ -46,13 +47,17 @@ def connected_robot(
     for carried in () if plan is None else plan.carried:
         name, numbers = carried.object_name, carried.object_marker.tolist()
         indices = np.array([contract.driven.further.index(number) for number in numbers])
-        if name not in session.held.values():  # else it moves with the tool
+        follows = tracked is not None and tracked.name == name
+        if not follows and name not in session.held.values():  # else it moves with the tool
             s, sigma = carried.s_object, carried.sigma_object
             sigma = np.full(s.shape[:2], np.nan) if sigma is None else sigma
             watches.append(ObjectWatch(name, numbers, indices, s, sigma, images_by_motion(calibration, s)))
     alone = len(watches) == 1 and scenario.world.inputs.displaced is None
+    session.followed = None
     session.at = watches[0] if alone else None  # if there are several, an action may take any
-    return DrivenRobot(steered, plant, _known_of(scenario, contract, calibration, law), monitor, watches)
+    return DrivenRobot(
+        steered, plant, _known_of(scenario, contract, calibration, law), monitor, watches, tracked
+    )
 
 
 def _known_of(scenario: RunScenario, contract: Contract, calibration: Calibration, law: str) -> Known:

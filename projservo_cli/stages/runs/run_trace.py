@@ -27,6 +27,7 @@ from projservo_cli.monitoring.innovation_tests import WINDOW
 from projservo_cli.records import (
     BoolArray,
     FloatArray,
+    GoalHistory,
     IncidenceHistory,
     Plan,
     PlanFollowing,
@@ -40,6 +41,7 @@ from projservo_cli.records import (
 from projservo_cli.simulation.analytic_plant import rig_distance
 from projservo_cli.simulation.robot_with_faults import obstruction_of
 from projservo_cli.stages.carried_goals import markers_now
+from projservo_cli.stages.runs.followed_goal import history_of
 from projservo_cli.stages.runs.law_run import LawRun
 from projservo_cli.task.body_pose import SETTLED, fit_body
 from projservo_cli.task.face import Task
@@ -111,6 +113,7 @@ def trace_of(run: LawRun) -> Trace:
             center=poses.center,
         ),
         of_incidences=_incidences(run),
+        of_goal=_of_goal(run),
         frames=None if driven is None else driven.film.recorded(),
     )
 
@@ -142,7 +145,7 @@ def _history_of(run: LawRun) -> RunHistory:
     errors, read = log.errors[:rows], log.read[:rows]
     if driven is not None:  # the log has the predicted rest of the robot instead of readings
         read = _whole(driven.readings, rows)
-    s_star = run.scenario.ends.by_points().s_star
+    s_star = run.s_star
     return RunHistory(
         q=log.q[:rows],
         q_read=None if np.array_equal(read, log.q[:rows]) else read,
@@ -211,6 +214,13 @@ def _stated_mm(run: LawRun) -> dict[str, Any]:
     elif (goal := scenario.goal_pixels) is not None:
         parts.append(rigid_fit(calibration, q, *goal).off_mm(posture, calibration.M))
     return found | {"estimated_position_error_mm": float(np.linalg.norm([*parts, *found.values()]))}
+
+
+def _of_goal(run: LawRun) -> GoalHistory | None:
+    """Return the history of a goal that moved; None of one that stayed."""
+    if run.goal is None or not run.goal.periods:
+        return None
+    return history_of(run.goal, run.scenario.world, run.scenario.true_ends.goal, run.steps + 1)
 
 
 def _left(log: Log, steps: int) -> tuple[float | None, float | None]:
@@ -326,6 +336,11 @@ def _reason(run: LawRun, joint: int, remaining: tuple[float | None, float | None
         verdict.replace(" ", "_"), REFUSES, Subject(name=name, joints=(joint + 1,)), error, unit=unit
     )
     at_step = replace(own, amount=float(steps), unit="1")
+    if verdict == "followed" and run.goal is not None:
+        errors, stated = run.goal.over_window
+        yield replace(own, severity=NOTE, amount=errors, limit=stated)
+        yield from _unkept(run, at_step)
+        return
     if verdict == "converged":
         yield replace(own, severity=NOTE, limit=within)
         yield from (*_noisy_markers(run), *_apart(run), *_unkept(run, at_step))

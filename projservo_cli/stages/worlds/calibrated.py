@@ -166,6 +166,13 @@ class CalibratedWorld:
         """Return the true poses of the tool at the ends of a task; NaN if unknown."""
         return _UNKNOWN
 
+    def true_motion(self, t: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """True displacements (k, 4, 4) of the object of the goal at times (k,), s, since the plan.
+
+        With its middle (4,) then, m; NaN if unknown.
+        """
+        return np.full((len(t), 4, 4), np.nan), np.full(4, np.nan)
+
     def nearest_ends(self, images: TaskImages, ends: Ends, plant: Plant, H: FloatArray) -> Ends:
         """Return true ends, of goals of incidences with the one nearest to the displacement H (4, 4)."""
         return ends

@@ -115,6 +115,13 @@ class SimulatedWorld(CalibratedWorld):
         back = displacement_back(truth.model, body, H, positioned(asked, self.numbers), shows, metre)
         return Ends(ends.base_tool, back @ ends.goal_pose, back @ ends.goal)
 
+    def true_motion(self, t: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """As of all worlds."""
+        placed = self.inputs.carriers[0].placed
+        assert placed is not None
+        back = np.linalg.inv(placed.T)
+        return np.array([placed.at(one) @ back for one in t.tolist()]), (placed.X @ placed.T.T).mean(axis=0)
+
     def nearest_ends(self, images: TaskImages, ends: Ends, plant: Plant, H: FloatArray) -> Ends:
         """Return true ends, of goals of incidences with the one nearest to the displacement H (4, 4)."""
         if not images.goal.incidences or not np.isfinite(ends.goal_pose).all():

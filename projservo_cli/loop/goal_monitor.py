@@ -1,0 +1,255 @@
+"""Following: a law is led to a goal that an object carries while it moves, and the run is judged by it.
+
+A law of gain λ comes to rest at its goal as exp(−λ t). Given the goal where it will be 1/λ later, it moves
+along with the goal: λ (x* + v/λ − x) = λ (x* − x) + v. The law stays as it is, and so do its limits.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from projservo_cli.control.law import State
+from projservo_cli.findings import REFUSES, Finding, Subject, from_text
+from projservo_cli.geometry.kinematics import project
+from projservo_cli.image_size import within_images
+from projservo_cli.loop.python_loop import BuiltInLaw
+from projservo_cli.loop.verdicts import (
+    CONVERGED,
+    DIVERGED,
+    FOLLOWED,
+    JOINT_LIMIT,
+    LOST_GOAL,
+    MAX_STEPS,
+    NO_PROGRESS,
+    OUT_OF_REACH,
+    OUT_OF_VIEW,
+    RUNNING,
+    TOO_FAST,
+    WAITING,
+    Limits,
+    Log,
+    tolerance,
+)
+from projservo_cli.records import MM, FloatArray, WorkFailed
+from projservo_cli.robots.latency_compensation import DrivenRobot
+from projservo_cli.task.incidences import image_error_at
+from projservo_cli.task.moving_goal import MovingGoal
+
+# Rms of the errors over their stated deviation that counts as followed.
+_WITHIN = 3.0
+# Time in which the velocity of an object is learnt, s: until then its goal is not led.
+_LEARNT_S = 0.4
+# Share of what set-points and readings showed of the lag of servos that the next period keeps.
+_KEPT = 0.9
+# Consecutive periods in which a limit of an estimate is passed that count as passed.
+_SURE = 5
+
+
+class FollowLimits(NamedTuple):
+    """When a goal counts as followed, and when it is given up."""
+
+    seconds: float  # for which it is followed, s
+    max_speed: float  # of its object, mm/s, or px/s if no length is known
+    lost_s: float  # for which its motion is predicted, s
+    approach_mm: float  # distance of the tool from the goal below which nothing is predicted
+
+
+class Followed(NamedTuple):
+    """The goal in a period of a run."""
+
+    t: float  # by the clock of the robot, s
+    D: FloatArray  # (4, 4) displacement of the goal since the motion was planned
+    s_star: FloatArray  # (V, m, 2) px of the face there
+    error: tuple[float, float, float]  # px, mm and deg of the tool from the goal
+    sigma_px: float  # stated deviation of the error
+    speed: float  # of the object, mm/s or px/s
+    unseen_s: float  # since its object was seen
+
+
+class GoalMonitor:
+    """The goal of a run that moves: it leads the law, and rules by how well the goal is followed.
+
+    ``periods``: the goal over time. ``since``: period from which on it is followed; None before.
+    """
+
+    def __init__(
+        self, law: BuiltInLaw, goal: MovingGoal, robot: DrivenRobot, limits: Limits, asked: FollowLimits
+    ) -> None:
+        self._law, self._goal, self._robot, self._limits, self._asked = law, goal, robot, limits, asked
+        self.lead_s = 1.0 / (law.gains.gain_t * law.gains.scale)
+        self.periods: list[Followed] = []
+        self.since: int | None = None
+        self.reason: Finding | None = None
+        self._fast = 0
+        # Where the arm came to rest when asked last, and sums of its lag times its speed, and of its square.
+        self._rest: FloatArray = np.zeros(0)
+        self._behind: FloatArray = np.zeros(2)
+        self._turned: Finding | None = None  # why the law cannot be given the goal
+        self._ends: tuple[int, FloatArray, int] | None = None  # verdict, last velocity, periods since
+
+    def lead(self) -> FloatArray:
+        """Give the law the goal where it will be, and return the images (V, m, 2) of the face where it is."""
+        t, goal = self._robot.steered.reading.t_q, self._goal
+        self._leads = bool(self.periods) and t - self.periods[0].t >= _LEARNT_S
+        # The law measures the arm where it will come to rest, its servos' lag later.
+        arrives = t + self._servo_lag_s(t)
+        self._now = goal.tracker.at(arrives)
+        self._D = goal.moved(self._now)
+        ahead = goal.tracker.at(arrives + self.lead_s)
+        images = goal.at(goal.moved(ahead if self._leads else self._now))
+        self._ahead, self._turned = images.by_points().s_star, None
+        try:
+            self._law.aim(images.task(self._law.law.model))
+        except WorkFailed as error:
+            self._turned = from_text(str(error), REFUSES)
+        self._here = goal.at(self._D)
+        self.s_star, now = self._here.by_points().s_star, self._now
+        self.periods.append(
+            Followed(
+                t=t,
+                D=self._D,
+                s_star=self.s_star,
+                error=(math.nan,) * 3,
+                sigma_px=goal.sigma_px(now, self._D @ goal.H),
+                speed=now.speed_mm_s if math.isfinite(now.speed_mm_s) else now.speed_px_s,
+                unseen_s=goal.tracker.unseen_s(t),
+            )
+        )
+        return self.s_star
+
+    def _servo_lag_s(self, t: float) -> float:
+        """Time by which joint readings follow the set-points of the last periods, at time t, s."""
+        rest, steered = self._robot.steered.set_point.at_rest, self._robot.steered
+        if self.periods and t > self.periods[-1].t:
+            speed = (rest - self._rest) / (t - self.periods[-1].t)
+            behind = float((rest - steered.reading.q) @ speed), float(speed @ speed)
+            self._behind = _KEPT * self._behind + behind
+        self._rest = rest
+        lag = self._behind[0] / self._behind[1] if self._behind[1] > 0.0 else 0.0
+        return min(max(lag, 0.0), self._robot.robot.bounds.max_servo_lag_s)
+
+    def judge(self) -> float:
+        """Return the image error of the tool as measured, px rms, against the goal where it is."""
+        state = self._law.state
+        if math.isfinite(float(state.face_px[0])):  # it measured
+            error = self._error(state, self._D @ self._goal.H)
+            self.periods[-1] = self.periods[-1]._replace(error=error)
+        return self.periods[-1].error[0]
+
+    def _error(self, state: State, H_star: FloatArray) -> tuple[float, float, float]:
+        """Error of the tool as measured from the goal at H_star (4, 4): px, mm and deg.
+
+        A goal of incidences is met by many poses, so it has no mm and deg.
+        """
+        goal, model = self._goal, self._law.law.model
+        if not goal.whole:
+            rows = self._here.task(model).incidences
+            return image_error_at(rows, state.pose), math.nan, math.nan
+        A_star = goal.images.body.M[: len(state.A)] @ H_star.T
+        off = project(model.P, state.A) - project(model.P, A_star)
+        return float(np.sqrt(np.square(off).sum(axis=-1).mean())), *goal.off(state.pose, H_star)
+
+    @property
+    def followed(self) -> list[Followed]:
+        """Periods since the goal was reached last; none before."""
+        return [] if self.since is None else self.periods[self.since :]
+
+    def goes_on(self, limits: Limits) -> None:
+        """Lead the law on by other limits, to no verdict of its own but that the goal is lost."""
+        self._limits, self._asked = limits, self._asked._replace(seconds=math.inf)
+
+    @property
+    def over_window(self) -> tuple[float, float]:
+        """Image error since then, px rms over time, and the error that counts as followed."""
+        squares = np.nanmean([(one.error[0] ** 2, one.sigma_px**2) for one in self.followed], axis=0)
+        return math.sqrt(squares[0]), _WITHIN * math.sqrt(squares[1])
+
+    def ruled(self, log: Log, k: int, verdict: int, q_dot: FloatArray) -> int:
+        """Return the new verdict; the arm slows down before it ends a run without its goal."""
+        if self._ends is not None:
+            return self._slowed(q_dot)
+        if verdict in (JOINT_LIMIT, OUT_OF_VIEW):
+            return OUT_OF_REACH
+        if verdict == NO_PROGRESS or k == self._limits.max_steps:
+            return MAX_STEPS
+        if verdict == DIVERGED and np.isfinite(q_dot).all():
+            verdict = RUNNING  # the goal went away faster
+        if verdict not in (RUNNING, CONVERGED, WAITING):
+            return verdict
+        cause = self._cause(log, k, q_dot)
+        if cause != RUNNING:
+            before = log.q_dot[k - 1] if k else np.zeros_like(q_dot)
+            self._ends = cause, before.copy(), 0
+            return self._slowed(q_dot)
+        if verdict == WAITING:
+            return verdict
+        return self._followed(log, k)
+
+    def _followed(self, log: Log, k: int) -> int:
+        """``FOLLOWED`` once the error stayed within its deviation for long enough."""
+        now = self.periods[-1]
+        within = tolerance(self._limits, float(log.fit[k, 2]), self._robot.noise_ratio)
+        stated = math.hypot(within, now.sigma_px)
+        self.periods[-1] = now._replace(sigma_px=stated)
+        if self.since is None:
+            arrived = self._leads and now.error[0] <= stated
+            self.since = len(self.periods) - 1 if arrived else None
+            return RUNNING
+        window = self.followed
+        if now.t - window[0].t < self._asked.seconds:
+            return RUNNING
+        error, most = self.over_window
+        if error <= most:
+            return FOLLOWED
+        self.since = None
+        return RUNNING
+
+    def _cause(self, log: Log, k: int, q_dot: FloatArray) -> int:
+        """Why the goal is given up; ``RUNNING`` if it is not."""
+        now, asked = self.periods[-1], self._asked
+        near = now.error[1] < asked.approach_mm
+        patience = _SURE * self._robot.robot.bounds.period if near else asked.lost_s
+        if now.unseen_s > patience:
+            self.reason = Finding("goal_unseen", REFUSES, amount=now.unseen_s, limit=patience, unit="s")
+            return LOST_GOAL
+        self._fast = self._fast + 1 if self._leads and now.speed > asked.max_speed else 0
+        unit, size = ("m/s", 1.0 / MM) if math.isfinite(self._now.speed_mm_s) else ("px/s", 1.0)
+        if self._fast > _SURE:
+            amount, limit = (size * speed for speed in (now.speed, asked.max_speed))
+            self.reason = Finding("goal_fast", REFUSES, amount=amount, limit=limit, unit=unit)
+            return TOO_FAST
+        return self._beyond(log, k, q_dot)
+
+    def _beyond(self, log: Log, k: int, q_dot: FloatArray) -> int:
+        """``OUT_OF_REACH`` if the goal is about to leave images or joint limits; otherwise ``RUNNING``."""
+        plant, ahead_s = self._robot.plant, self.lead_s
+        outside = ~np.asarray(within_images(self._ahead, plant.image_size[:, None]).all(axis=1))
+        if self._turned is not None:
+            self.reason = self._turned
+            return OUT_OF_REACH
+        if outside.sum() > len(outside) - plant.min_views:
+            view = self._robot.robot.view[int(np.argmax(outside))]
+            self.reason = Finding("goal_leaves_view", REFUSES, Subject(views=(view,)), ahead_s, unit="s")
+            return OUT_OF_REACH
+        if self.since is None:
+            return RUNNING
+        q = log.read[k] + ahead_s * q_dot
+        beyond = np.maximum(plant.limits.lower - q, q - plant.limits.upper)
+        if self._limits.stop_at_joint_limit and (beyond > 0.0).any():
+            joint = int(np.argmax(beyond))
+            of = Subject(joints=(joint + 1,))
+            self.reason = Finding("goal_leaves_reach", REFUSES, of, ahead_s, unit="s")
+            return OUT_OF_REACH
+        return RUNNING
+
+    def _slowed(self, q_dot: FloatArray) -> int:
+        """Slow the arm down within its limits; the verdict once it is at rest."""
+        assert self._ends is not None
+        verdict, before, periods = self._ends
+        bounds = self._robot.robot.bounds
+        least = np.abs(before) / (bounds.limits.acceleration * bounds.period)
+        needed = max(1, math.ceil(float(least.max())))
+        self._ends = verdict, before, periods + 1
+        q_dot[:] = before * (1.0 - (periods + 1) / needed)
+        return verdict if periods + 1 >= needed else RUNNING

@@ -1,0 +1,119 @@
+"""The goal of a run that an object carries while a law runs: made, and its history."""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from projservo_cli.laws import BODY_LAWS
+from projservo_cli.loop.goal_monitor import FollowLimits, GoalMonitor
+from projservo_cli.records import MM, FloatArray, GoalHistory, InputError, Plan
+from projservo_cli.robots.latency_compensation import Tracked
+from projservo_cli.robots.session import Session
+from projservo_cli.stages.carried_goals import in_metres, object_of
+from projservo_cli.stages.scenario import RunScenario
+from projservo_cli.stages.worlds.calibrated import CalibratedWorld
+from projservo_cli.task.moving_goal import MovingGoal
+from projservo_cli.task.object_bundle_adjustment import ObjectView
+from projservo_cli.task.object_tracker import ObjectTracker
+from projservo_cli.task.target import TaskImages
+
+_NONE = np.full(3, np.nan)
+
+
+class FollowedGoal(NamedTuple):
+    """A goal to follow."""
+
+    goal: MovingGoal
+    limits: FollowLimits
+    tracked: Tracked
+
+
+def followed_goal(
+    scenario: RunScenario, law: str, images: Callable[[], TaskImages], plan: Plan | None, session: Session
+) -> FollowedGoal | None:
+    """Return the goal of a law that its object carries while it runs; None for a goal that stays.
+
+    It stays once the tool has taken the object in the session.
+
+    images : start and goal as the law measures them.
+
+    Raises InputError for a law that does not measure with the calibrated body.
+    """
+    inputs = scenario.world.inputs
+    if plan is None or not plan.carried or not inputs.carriers[0].settings.follow:
+        return None
+    if inputs.carriers[0].name in session.held.values():
+        return None
+    if law not in BODY_LAWS or not len(scenario.world.body.M):
+        laws = ", ".join(BODY_LAWS)
+        raise InputError(
+            f"{law} cannot follow objects.{inputs.carriers[0].name}: a goal that moves needs a law that "
+            f"measures with the body: {laws}, and a calibration that is usable"
+        )
+    (carried,), carrier, c = plan.carried, inputs.carriers[0], scenario.world.calibration
+    contract, asked, numbers = scenario.servo.contract, carrier.settings, carried.object_marker.tolist()
+    assert contract is not None
+    if contract.time_offset_s is None and c.time_offset is None:
+        raise InputError(
+            f"objects.{carrier.name}.follow: the latency of the cameras is not known, and the object moves "
+            "meanwhile: calibrate from images of a moving arm (projservo record), or set plant.time_offset_s"
+        )
+    assert carried.s_object_taught is not None
+    looks = ObjectView(carried.s_object_taught), ObjectView(carried.s_object, carried.sigma_object)
+    metric = in_metres(c, carrier.lengths)[0]
+    tracker = ObjectTracker.of(
+        c,
+        numbers,
+        looks,
+        metric=metric,
+        acceleration=asked.acceleration,
+        max_acceleration=asked.max_acceleration,
+        name=carrier.name,
+    )
+    whole = not scenario.exact.goal.incidences
+    goal = MovingGoal(images(), scenario.world.model, object_of(c, carried, metric), tracker, whole)
+    most = math.inf if asked.max_speed_mm_s is None else asked.max_speed_mm_s
+    limits = FollowLimits(scenario.servo.stop.follow_s, most, asked.lost_s, asked.approach_mm)
+    places = [contract.driven.further.index(number) for number in numbers]
+    return FollowedGoal(goal, limits, Tracked(carried.object_name, places, tracker))
+
+
+def history_of(monitor: GoalMonitor, world: CalibratedWorld, goal: FloatArray, times: int) -> GoalHistory:
+    """Return the history of a goal at some times of a run.
+
+    goal : (4,) its true centre when the motion was planned, m.
+    """
+    rows, since = monitor.periods, monitor.followed
+    rows = [*rows, *[rows[-1]._replace(error=(math.nan,) * 3)] * (times - len(rows))]
+    t = np.array([one.t for one in rows])
+    errors = np.array([one.error for one in rows]).reshape(-1, 3)
+    left = np.array([one.error for one in since]).reshape(-1, 3)
+    rms, most, speed = _NONE, math.nan, math.nan
+    if since:
+        rms, most = np.sqrt(np.nanmean(left**2, axis=0)), float(np.max(left[np.isfinite(left[:, 0]), 1]))
+        speed = float(np.mean([one.speed for one in since])) if math.isfinite(most) else math.nan
+    px, mm, deg, max_mm, mm_s = (None if math.isnan(x) else float(x) for x in (*rms, most, speed))
+    T, middle = world.true_motion(t)
+    seconds = np.maximum(np.diff(t, prepend=t[0]), 1e-9)
+    steps = np.linalg.norm(np.diff((T @ middle)[:, :3], axis=0, prepend=np.nan), axis=1)
+    return GoalHistory(
+        followed_rms_px=px,
+        followed_rms_mm=mm,
+        followed_max_mm=max_mm,
+        followed_rms_deg=deg,
+        followed_seconds=since[-1].t - since[0].t if since else 0.0,
+        followed_speed_mm_s=mm_s,
+        goal_time=t,
+        goal_error_px=errors[:, 0],
+        goal_error_mm=errors[:, 1],
+        goal_error_deg=errors[:, 2],
+        goal_sigma_px=np.array([one.sigma_px for one in rows]),
+        goal_s=np.array([one.s_star for one in rows]),
+        goal_displacement=np.array([one.D for one in rows]),
+        goal_speed=np.array([one.speed for one in rows]),
+        goal_unseen_s=np.array([one.unseen_s for one in rows]),
+        goal_center=(T @ goal)[:, :3],
+        goal_true_speed=MM * steps / seconds,
+    )

@@ -1,0 +1,77 @@
+"""A goal on an object that moves: where the object has it, by its tracker."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from projservo_cli.geometry.kinematics import project
+from projservo_cli.records import FloatArray, Model
+from projservo_cli.task.displaced_object import DisplacedObject
+from projservo_cli.task.object_tracker import ObjectMotion, ObjectTracker
+from projservo_cli.task.target import Place, TaskImages
+
+_STEP = 1e-5  # of a difference, in a coordinate of a motion
+
+
+@dataclass(frozen=True, eq=False)
+class MovingGoal:
+    """A goal of the tool that one object carries."""
+
+    images: TaskImages  # start and goal as a law measures them, with a body, the goal where the plan has it
+    model: Model  # calibrated
+    planned: DisplacedObject  # the object when the motion was planned
+    tracker: ObjectTracker
+    whole: bool  # whether it is the whole pose, instead of incidences
+
+    def moved(self, motion: ObjectMotion) -> FloatArray:
+        """Displacement (4, 4) of the goal since the motion was planned."""
+        return np.asarray(motion.D @ np.linalg.inv(self.planned.D))
+
+    @cached_property
+    def H(self) -> FloatArray:
+        """Displacement (4, 4) of the body at the goal when the motion was planned."""
+        return self.images.displacement_at_goal(self.model)
+
+    def at(self, D: FloatArray) -> TaskImages:
+        """Start and goal, with the goal displaced by D (4, 4) since the motion was planned."""
+        goal = self.images.goal
+        places = tuple(place._replace(s=self._images(D, place)) for place in goal.locations)
+        return self.images._replace(goal=goal._replace(s=self._images(D, Place(goal.s)), locations=places))
+
+    def _images(self, D: FloatArray, place: Place) -> FloatArray:
+        """Images (V, b, 2) of the body at a place, displaced by D (4, 4); what a fit leaves goes along."""
+        H, left = self._fits[place.s.tobytes()]
+        return self._projected(D @ H) + left
+
+    @cached_property
+    def _fits(self) -> dict[bytes, tuple[FloatArray, FloatArray]]:
+        """Displacement (4, 4) of the body at each place, and what its fit leaves of the images (V, b, 2)."""
+        found, goal = {}, self.images.goal
+        for s in (goal.s, *(place.s for place in goal.locations)):
+            H = self.images.to(s).displacement_at_goal(self.model)
+            found[s.tobytes()] = H, s - self._projected(H)
+        return found
+
+    def _projected(self, H: FloatArray) -> FloatArray:
+        """Pixels (V, b, 2) of the body displaced by H (4, 4)."""
+        return np.asarray(project(self.model.P, self.images.body.M @ H.T, self.model.lens))
+
+    def sigma_px(self, motion: ObjectMotion, H: FloatArray) -> float:
+        """Deviation of the images of the goal at H (4, 4) by the motion, px rms per marker and view."""
+        E = _STEP * (motion.D @ motion.E @ np.linalg.inv(motion.D))
+        s = np.stack([self._projected(H), *map(self._projected, H + E @ H)])
+        by = (s[1:] - s[0]) / _STEP
+        return float(np.sqrt(np.einsum("ivkd,ij,jvkd->", by, motion.covariance, by) / s[0, ..., 0].size))
+
+    def off(self, H: FloatArray, H_star: FloatArray) -> tuple[float, float]:
+        """Distance of the body at H (4, 4) from the goal at H_star (4, 4), rms mm, and angle, deg.
+
+        NaN without a known length, or if the joints leave angles open.
+        """
+        rig, M = self.planned.rig, self.images.body.M
+        apart = (M @ (rig.G @ (H - H_star)).T)[:, :3]
+        turn = (rig.G @ H @ np.linalg.inv(rig.G @ H_star))[:3, :3]
+        angle = Rotation.from_matrix(turn).magnitude() if rig.rigid else np.nan
+        return float(self.planned.unit_mm * np.sqrt((apart**2).sum(axis=1).mean())), float(np.degrees(angle))
