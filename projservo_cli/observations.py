@@ -26,7 +26,7 @@ from projservo_cli.store.observation_tables import (
 
 
 class KnownNoise(NamedTuple):
-    """What is known of the noise of observations."""
+    """Known noise of observations."""
 
     px: float | None = None  # standard deviation of a coordinate; None to estimate it
     joint: float | None = None  # rms of readings less true joints, rad; None to estimate it

@@ -1361,6 +1361,14 @@ class PlanFollowing(RecordPart):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class ImagesUsed(RecordPart):
+    """Use that a run made of images."""
+
+    features: str = _scalar(about="image features: points or body")
+    untested: str = _scalar(about="reason why the images were not tested against the calibration", default="")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class RecordedFrames(RecordPart):
     """Camera images that were kept of a run; absent if the robot provides none."""
 
@@ -1385,11 +1393,10 @@ class Trace(Composite):
     )
     steps: int = _scalar(about="commands sent")
     period: float = _scalar("s", "control period")
-    features: str = _scalar(about="image features: points or body")
-    untested: str = _scalar(about="reason why the images were not tested against the calibration", default="")
     overruns: int | None = _optional_scalar(
         about="number of missed periods; none for the ideal simulated robot"
     )
+    images_used: ImagesUsed
     following: PlanFollowing
     errors: RunErrors
     metrics: RunMetrics

@@ -50,8 +50,8 @@ from projservo_cli.store.display import (
     xarray,
 )
 from projservo_cli.store.files_and_locks import bytes_of
-from projservo_cli.task.displaced_object import DisplacedObject
-from projservo_cli.task.object_bundle_adjustment import ObjectView
+from projservo_cli.task.objects.displaced_object import DisplacedObject
+from projservo_cli.task.objects.object_bundle_adjustment import ObjectView
 
 _AT_ONCE = 100  # poses whose derivatives are worked out together: more of them leave the cache
 _MAX_BYTES = 10_000_000  # maximum size of a URDF

@@ -48,10 +48,9 @@ class Steps:
 
         inputs = servo_inputs(self.config)
         assert self.session is not None
-        assert inputs.contract is not None
         joints = inputs.plan.joints.joints(c.joint_types, c)
         steered = opened_robot(
-            self.session, inputs.contract.driven, joints, observed_numbers(inputs.plan, c), c.view
+            self.session, inputs.required_contract.driven, joints, observed_numbers(inputs.plan, c), c.view
         )
         actions = {name for step in self.config.steps.values() for name in step.act or ()}
         self.session.require_acts(actions)  # refuses actions that the robot lacks

@@ -116,7 +116,7 @@ class StepParts(NamedTuple):
 
 
 class AlongPlan(NamedTuple):
-    """Where a law is along a plan, and the plan there."""
+    """Progress of a law along a plan, and the plan there."""
 
     clock: FloatArray  # (1,) completed periods of the plan, if there is one
     A_ref: FloatArray  # (m, 4) points of the face by the plan

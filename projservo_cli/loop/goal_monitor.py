@@ -34,7 +34,7 @@ from projservo_cli.loop.verdicts import (
 from projservo_cli.records import MM, FloatArray, WorkFailed
 from projservo_cli.robots.latency_compensation import DrivenRobot
 from projservo_cli.task.incidences import image_error_at
-from projservo_cli.task.moving_goal import MovingGoal
+from projservo_cli.task.objects.moving_goal import MovingGoal
 
 # Rms of the errors over their stated deviation that counts as followed.
 _WITHIN = 3.0
@@ -52,7 +52,7 @@ class FollowLimits(NamedTuple):
     seconds: float  # for which it is followed, s
     max_speed: float  # of its object, mm/s, or px/s if no length is known
     lost_s: float  # for which its motion is predicted, s
-    approach_mm: float  # distance of the tool from the goal below which nothing is predicted
+    approach_mm: float  # distance of the tool from the goal within which no motion is predicted
 
 
 class Followed(NamedTuple):
@@ -100,7 +100,7 @@ class GoalMonitor:
         images = goal.at(goal.moved(ahead if self._leads else self._now))
         self._ahead, self._turned = images.by_points().s_star, None
         try:
-            self._law.aim(images.task(self._law.law.model))
+            self._law.lead_to(images.task(self._law.law.model))
         except WorkFailed as error:
             self._turned = from_text(str(error), REFUSES)
         self._here = goal.at(self._D)
@@ -156,7 +156,7 @@ class GoalMonitor:
         return [] if self.since is None else self.periods[self.since :]
 
     def goes_on(self, limits: Limits) -> None:
-        """Lead the law on by other limits, to no verdict of its own but that the goal is lost."""
+        """Lead the law on by other limits, to no other verdict than that the goal is lost."""
         self._limits, self._asked = limits, self._asked._replace(seconds=math.inf)
 
     @property
@@ -206,7 +206,7 @@ class GoalMonitor:
         return RUNNING
 
     def _cause(self, log: Log, k: int, q_dot: FloatArray) -> int:
-        """Why the goal is given up; ``RUNNING`` if it is not."""
+        """Return the cause to give the goal up; ``RUNNING`` if there is none."""
         now, asked = self.periods[-1], self._asked
         near = now.error[1] < asked.approach_mm
         patience = _SURE * self._robot.robot.bounds.period if near else asked.lost_s
@@ -248,8 +248,8 @@ class GoalMonitor:
         assert self._ends is not None
         verdict, before, periods = self._ends
         bounds = self._robot.robot.bounds
-        least = np.abs(before) / (bounds.limits.acceleration * bounds.period)
-        needed = max(1, math.ceil(float(least.max())))
+        periods_each = np.abs(before) / (bounds.limits.acceleration * bounds.period)
+        needed = max(1, math.ceil(float(periods_each.max())))
         self._ends = verdict, before, periods + 1
         q_dot[:] = before * (1.0 - (periods + 1) / needed)
         return verdict if periods + 1 >= needed else RUNNING

@@ -229,7 +229,7 @@ class BuiltInLaw:
         self.state.plan.clock[0] = 0.0
         self._bound = None
 
-    def aim(self, task: Task) -> None:
+    def lead_to(self, task: Task) -> None:
         """Take another goal; the plan that is followed, and its time, stay."""
         self.law = self.law._replace(task=self._weighed(task)._replace(reference=self.law.task.reference))
         self._bound = None

@@ -677,9 +677,12 @@ class Detector:
         total, onsets, fixed = self.memory.total, self.memory.onsets(), self._errors.fixed
         if not onsets:
             return 0.0
-        late, greatest = min(onsets, key=lambda sums: abs(sums.views - _NEARLY_WHOLE * total.views)), 0.0
+        last_onset, greatest = (
+            min(onsets, key=lambda sums: abs(sums.views - _NEARLY_WHOLE * total.views)),
+            0.0,
+        )
         cameras = fixed + len(total.seen) * (CAMERA - 1)
-        for since, end in ((onsets[0], self._errors.f), (late, cameras)):
+        for since, end in ((onsets[0], self._errors.f), (last_onset, cameras)):
             reduced = self._reduced(since, total, sigma_t, [])
             persistent_share = max(0.0, 1.0 - _one_of(since, total)) * self.memory.persistent
             persistent_share += (total.bias - since.bias).sum() / (total.seen - since.seen).sum()

@@ -25,7 +25,7 @@ from projservo_cli.robots.latency_estimation import DelayPrior, Delays, squares_
 from projservo_cli.robots.object_watch import ObjectWatch
 from projservo_cli.robots.pacing import Steered
 from projservo_cli.simulation.analytic_plant import Plant, observe
-from projservo_cli.task.object_tracker import ObjectTracker
+from projservo_cli.task.objects.object_tracker import ObjectTracker
 
 # Markers that no detector sees at one pixel.
 _AT_ONE_PIXEL = 3
@@ -58,7 +58,7 @@ class Tracked(NamedTuple):
     """An object that carries a goal while it moves."""
 
     name: str
-    places: Sequence[int]  # (k,) of its markers among the markers of objects
+    indices: Sequence[int]  # (k,) of its markers among the markers of objects
     tracker: ObjectTracker
 
 
@@ -188,11 +188,11 @@ class DrivenRobot:
         """Show the object that moves in new frames (V,), taken at times t (V,), s, to its tracker."""
         if self.tracked is None or not fresh.any():
             return
-        reading, (_, places, tracker) = self.steered.reading, self.tracked
-        s = np.where(fresh[:, None, None], reading.s_objects[:, places], np.nan)
+        reading, (_, indices, tracker) = self.steered.reading, self.tracked
+        s = np.where(fresh[:, None, None], reading.s_objects[:, indices], np.nan)
         sigma = np.full(s.shape[:2], max(self.known.sigma_px, MIN_SIGMA))
         if reading.sigma_objects is not None:
-            sigma = reading.sigma_objects[:, places]
+            sigma = reading.sigma_objects[:, indices]
         tracker.observe(t, s, sigma)
         if tracker.pushed is not None and not self.disturbance:
             self.disturbance = tracker.pushed

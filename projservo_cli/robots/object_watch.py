@@ -11,7 +11,7 @@ from projservo_cli.findings import REFUSES, Finding, Subject
 from projservo_cli.monitoring.innovation_tests import WINDOW
 from projservo_cli.records import FloatArray, IntArray
 from projservo_cli.robots.contract import Reading
-from projservo_cli.task.displaced_object import ALIKE_PX
+from projservo_cli.task.objects.displaced_object import ALIKE_PX
 
 # Frames of a view in a row that show an object elsewhere: as many as are seen before the first motion.
 _FRAMES = WINDOW

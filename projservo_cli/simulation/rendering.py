@@ -411,8 +411,8 @@ class Frames:
         """
         self._move(moved)
         still = np.abs(q - q[len(q) // 2]).max() < _STILL and not self.rendered.moving
-        instants = list(zip(q, times.tolist(), strict=True))
-        shots = [self._drawn(view, *at) for at in (instants[len(q) // 2 :][:1] if still else instants)]
+        shots_at = list(zip(q, times.tolist(), strict=True))
+        shots = [self._drawn(view, *at) for at in (shots_at[len(q) // 2 :][:1] if still else shots_at)]
         image = np.mean(shots, axis=0, dtype=np.float32)
         cv = self._finder.cv
         if self._scene.options.blur_px > 0.0:

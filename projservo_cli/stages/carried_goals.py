@@ -14,8 +14,8 @@ from projservo_cli.records import Calibration, CarriedByObject, FloatArray, Inpu
 from projservo_cli.robots.session import Session
 from projservo_cli.stages.scenario import Scenario
 from projservo_cli.stages.stage_inputs import CarryingObject, KnownLengths
-from projservo_cli.task.displaced_object import DisplacedObject
-from projservo_cli.task.object_bundle_adjustment import ObjectView, UncertainPoints
+from projservo_cli.task.objects.displaced_object import DisplacedObject
+from projservo_cli.task.objects.object_bundle_adjustment import ObjectView, UncertainPoints
 
 
 def in_metres(calibration: Calibration, known: KnownLengths) -> tuple[Metric | None, str]:

@@ -353,6 +353,13 @@ class ServoInputs:
     conditions: RunConditions
     contract: Contract | None  # None for the ideal plant
 
+    @property
+    def required_contract(self) -> Contract:
+        """Return the contract. Raises InputError for the ideal plant."""
+        if self.contract is None:
+            raise InputError("this needs a robot of the contract: set plant.use")
+        return self.contract
+
 
 class KnownLengths(NamedTuple):
     """Measured lengths on the tool."""

@@ -37,7 +37,7 @@ from projservo_cli.stages.record import shared_markers
 from projservo_cli.stages.stage_inputs import OwnRobot, PlanInputs, TeachInputs
 from projservo_cli.stages.worlds.external_robot import plugin_robot, simulated_robot, takes_limits
 from projservo_cli.store.display import require_radians
-from projservo_cli.task.displaced_object import RIGID
+from projservo_cli.task.objects.displaced_object import RIGID
 
 _FAR = 4.0  # standard deviations by which a marker may err
 _DIGITS = 4  # digits of written pixels

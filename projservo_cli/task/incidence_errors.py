@@ -16,7 +16,7 @@ from projservo_cli.metric.frame import changes_of
 from projservo_cli.monitoring.arrival_accuracy import metres_by
 from projservo_cli.records import MEET, MM, PARALLEL, PERPENDICULAR, Calibration, FloatArray, WorkFailed
 from projservo_cli.task.incidences import Incidence, points_of
-from projservo_cli.task.object_bundle_adjustment import (
+from projservo_cli.task.objects.object_bundle_adjustment import (
     NO_POINTS,
     BundleFit,
     ObjectView,

@@ -12,7 +12,7 @@ from projservo_cli.robots.session import Session
 from projservo_cli.stages.runs.run_trace import trace_of
 from projservo_cli.stages.scenario import run_scenario
 from projservo_cli.stages.servo import drive
-from projservo_cli.task.object_tracker import ObjectTracker
+from projservo_cli.task.objects.object_tracker import ObjectTracker
 from tests.configured import calibrate, plan
 from tests.known import configured
 

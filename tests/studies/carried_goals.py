@@ -21,8 +21,8 @@ from projservo_cli.image_size import within_images
 from projservo_cli.records import WorkFailed
 from projservo_cli.simulation.arm import camera_center
 from projservo_cli.simulation.random_tasks import random_tasks
-from projservo_cli.task.displaced_object import DisplacedObject
-from projservo_cli.task.object_bundle_adjustment import ObjectView
+from projservo_cli.task.objects.displaced_object import DisplacedObject
+from projservo_cli.task.objects.object_bundle_adjustment import ObjectView
 from tests.known import configured
 from tests.studies.common import in_two_processes, parser_of, quantiles, rate, written
 from tests.studies.hand_eye_coverage import pose

@@ -25,8 +25,8 @@ import projservo_cli as projservo
 from projservo_cli.config.settings_and_rules import truth_of
 from projservo_cli.geometry.kinematics import project
 from projservo_cli.simulation.random_tasks import random_tasks
-from projservo_cli.task.object_bundle_adjustment import ObjectView
-from projservo_cli.task.object_tracker import ObjectTracker
+from projservo_cli.task.objects.object_bundle_adjustment import ObjectView
+from projservo_cli.task.objects.object_tracker import ObjectTracker
 from tests.known import configured
 from tests.samples import hat
 from tests.studies.carried_goals import NOISE_PX, carried_pose, direction, scene, seen

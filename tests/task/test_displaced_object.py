@@ -9,8 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from projservo_cli.records import InputError, WorkFailed, changed
-from projservo_cli.task.displaced_object import DisplacedObject
-from projservo_cli.task.object_bundle_adjustment import ObjectView
+from projservo_cli.task.objects.displaced_object import DisplacedObject
+from projservo_cli.task.objects.object_bundle_adjustment import ObjectView
 from tests.calibration.simulated_robot import Robot, random_robot, rig
 from tests.metric.test_frame import calibrated
 from tests.samples import displacement, frame, pixels, prismatic, revolute

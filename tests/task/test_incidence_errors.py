@@ -17,7 +17,7 @@ from projservo_cli.task.incidence_errors import (
     placed_by,
 )
 from projservo_cli.task.incidences import Incidence
-from projservo_cli.task.object_bundle_adjustment import BundleFit, ObjectView
+from projservo_cli.task.objects.object_bundle_adjustment import BundleFit, ObjectView
 from tests.configured import calibrate, truth_of
 from tests.known import configured
 

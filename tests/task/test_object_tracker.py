@@ -12,8 +12,8 @@ from scipy.linalg import expm
 from scipy.stats import chi2
 
 from projservo_cli import messages
-from projservo_cli.task.object_bundle_adjustment import ObjectView
-from projservo_cli.task.object_tracker import ObjectTracker
+from projservo_cli.task.objects.object_bundle_adjustment import ObjectView
+from projservo_cli.task.objects.object_tracker import ObjectTracker
 from tests.calibration.simulated_robot import random_robot
 from tests.metric.test_frame import calibrated
 from tests.samples import displacement, frame, hat, pixels

@@ -14,9 +14,9 @@ from projservo_cli.robots.session import Session
 from projservo_cli.stages.carried_goals import in_metres, object_of
 from projservo_cli.stages.scenario import RunScenario
 from projservo_cli.stages.worlds.calibrated import CalibratedWorld
-from projservo_cli.task.moving_goal import MovingGoal
-from projservo_cli.task.object_bundle_adjustment import ObjectView
-from projservo_cli.task.object_tracker import ObjectTracker
+from projservo_cli.task.objects.moving_goal import MovingGoal
+from projservo_cli.task.objects.object_bundle_adjustment import ObjectView
+from projservo_cli.task.objects.object_tracker import ObjectTracker
 from projservo_cli.task.target import TaskImages
 
 _NONE = np.full(3, np.nan)
@@ -53,20 +53,19 @@ def followed_goal(
             f"measures with the body: {laws}, and a calibration that is usable"
         )
     (carried,), carrier, c = plan.carried, inputs.carriers[0], scenario.world.calibration
-    contract, asked, numbers = scenario.servo.contract, carrier.settings, carried.object_marker.tolist()
-    assert contract is not None
+    contract, asked = scenario.servo.required_contract, carrier.settings
+    numbers = carried.object_marker.tolist()
     if contract.time_offset_s is None and c.time_offset is None:
         raise InputError(
             f"objects.{carrier.name}.follow: the latency of the cameras is not known, and the object moves "
             "meanwhile: calibrate from images of a moving arm (projservo record), or set plant.time_offset_s"
         )
-    assert carried.s_object_taught is not None
-    looks = ObjectView(carried.s_object_taught), ObjectView(carried.s_object, carried.sigma_object)
+    observed = ObjectView(carried.s_object_taught), ObjectView(carried.s_object, carried.sigma_object)
     metric = in_metres(c, carrier.lengths)[0]
     tracker = ObjectTracker.of(
         c,
         numbers,
-        looks,
+        observed,
         metric=metric,
         acceleration=asked.acceleration,
         max_acceleration=asked.max_acceleration,
@@ -74,10 +73,10 @@ def followed_goal(
     )
     whole = not scenario.exact.goal.incidences
     goal = MovingGoal(images(), scenario.world.model, object_of(c, carried, metric), tracker, whole)
-    most = math.inf if asked.max_speed_mm_s is None else asked.max_speed_mm_s
-    limits = FollowLimits(scenario.servo.stop.follow_s, most, asked.lost_s, asked.approach_mm)
-    places = [contract.driven.further.index(number) for number in numbers]
-    return FollowedGoal(goal, limits, Tracked(carried.object_name, places, tracker))
+    max_speed = math.inf if asked.max_speed_mm_s is None else asked.max_speed_mm_s
+    limits = FollowLimits(scenario.servo.stop.follow_s, max_speed, asked.lost_s, asked.approach_mm)
+    indices = [contract.driven.further.index(number) for number in numbers]
+    return FollowedGoal(goal, limits, Tracked(carried.object_name, indices, tracker))
 
 
 def history_of(monitor: GoalMonitor, world: CalibratedWorld, goal: FloatArray, times: int) -> GoalHistory:
@@ -90,11 +89,11 @@ def history_of(monitor: GoalMonitor, world: CalibratedWorld, goal: FloatArray, t
     t = np.array([one.t for one in rows])
     errors = np.array([one.error for one in rows]).reshape(-1, 3)
     left = np.array([one.error for one in since]).reshape(-1, 3)
-    rms, most, speed = _NONE, math.nan, math.nan
+    rms, maximum, speed = _NONE, math.nan, math.nan
     if since:
-        rms, most = np.sqrt(np.nanmean(left**2, axis=0)), float(np.max(left[np.isfinite(left[:, 0]), 1]))
-        speed = float(np.mean([one.speed for one in since])) if math.isfinite(most) else math.nan
-    px, mm, deg, max_mm, mm_s = (None if math.isnan(x) else float(x) for x in (*rms, most, speed))
+        rms, maximum = np.sqrt(np.nanmean(left**2, axis=0)), float(np.max(left[np.isfinite(left[:, 0]), 1]))
+        speed = float(np.mean([one.speed for one in since])) if math.isfinite(maximum) else math.nan
+    px, mm, deg, max_mm, mm_s = (None if math.isnan(x) else float(x) for x in (*rms, maximum, speed))
     T, middle = world.true_motion(t)
     seconds = np.maximum(np.diff(t, prepend=t[0]), 1e-9)
     steps = np.linalg.norm(np.diff((T @ middle)[:, :3], axis=0, prepend=np.nan), axis=1)

@@ -58,7 +58,7 @@ _NOT_DRIVEN: Any = None  # replaces the results of a run
 
 
 class PlannedCourse(NamedTuple):
-    """How a run takes to its plan."""
+    """Mode of a run, and its plan."""
 
     mode: str = REGULATE  # of the run
     planned_s: float | None = None  # when the plan that it follows arrives, s
@@ -159,8 +159,7 @@ class LawRun:
         motion, its images must agree with the calibration there. The robot is always stopped and closed
         out, in a shared session at its end.
         """
-        scenario, contract = self.scenario, self.scenario.servo.contract
-        assert contract is not None
+        scenario, contract = self.scenario, self.scenario.servo.required_contract
         scenario.world.require_ready()
         controller = self.controller()
         shared, plan = self.brought.session, self.plan if isinstance(self.plan, Plan) else None
@@ -182,13 +181,13 @@ class LawRun:
                 limits, stall = scenario.termination, None
                 self.goal = GoalMonitor(controller, followed.goal, driven, limits, followed.limits)
             self.in_python(controller, driven, stall)
-            if followed is not None and self.verdict == "followed":
-                session.followed = followed.tracked.name, partial(self._go_on, controller, driven)
+            if followed is not None and self.goal is not None and self.verdict == "followed":
+                go_on = partial(self._go_on, controller, driven, self.goal)
+                session.followed = followed.tracked.name, go_on
 
-    def _go_on(self, law: LoopLaw, driven: DrivenRobot, seconds: float) -> None:
+    def _go_on(self, law: LoopLaw, driven: DrivenRobot, goal: GoalMonitor, seconds: float) -> None:
         """Follow the goal for a further time, s; raises WorkFailed if that fails."""
-        scenario, goal = self.scenario, self.goal
-        assert goal is not None
+        scenario = self.scenario
         period, limits = scenario.gains.period, scenario.termination
         limits = limits._replace(max_steps=max(1, math.ceil(seconds / period)))
         goal.goes_on(limits)

@@ -16,7 +16,7 @@ from projservo_cli.robots.object_watch import ObjectWatch
 from projservo_cli.robots.session import Session
 from projservo_cli.stages.scenario import RunScenario
 from projservo_cli.stages.stage_inputs import Contract
-from projservo_cli.task.displaced_object import images_by_motion
+from projservo_cli.task.objects.displaced_object import images_by_motion
 
 
 def connected_robot(
@@ -33,8 +33,7 @@ def connected_robot(
     given : an object of the contract instead of one of a class.
     plan : of which the objects that carry its goal are watched, all but the tracked one.
     """
-    contract, world, plant = scenario.servo.contract, scenario.world, scenario.plant_of(law)
-    assert contract is not None
+    contract, world, plant = scenario.servo.required_contract, scenario.world, scenario.plant_of(law)
     calibration = world.calibration
     steered = world.opened(session, contract, scenario.exact.q_start, plant, given)
     monitor = None

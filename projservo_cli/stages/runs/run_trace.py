@@ -28,6 +28,7 @@ from projservo_cli.records import (
     BoolArray,
     FloatArray,
     GoalHistory,
+    ImagesUsed,
     IncidenceHistory,
     Plan,
     PlanFollowing,
@@ -52,7 +53,7 @@ from projservo_cli.task.incidences import (
     images_of,
     points_of,
 )
-from projservo_cli.task.object_bundle_adjustment import NO_POINTS, ObjectView
+from projservo_cli.task.objects.object_bundle_adjustment import NO_POINTS, ObjectView
 from projservo_cli.task.target import TaskImages
 
 # Maximum residual of a body that agrees with its calibration, over the noise, px.
@@ -89,8 +90,10 @@ def trace_of(run: LawRun) -> Trace:
         findings=found,
         steps=steps,
         period=scenario.gains.period,
-        features="points" if np.isnan(log.fit[:rows, 2]).all() else "body",
-        untested=text((*untested, *lost), run.setup),
+        images_used=ImagesUsed(
+            features="points" if np.isnan(log.fit[:rows, 2]).all() else "body",
+            untested=text((*untested, *lost), run.setup),
+        ),
         overruns=None if driven is None else driven.steered.overruns,
         following=PlanFollowing(
             mode=run.course.mode,

@@ -41,7 +41,7 @@ from projservo_cli.stages.stage_inputs import CarryingObject, Contract, PlanInpu
 from projservo_cli.stages.worlds.external_robot import opened_robot, path_to
 from projservo_cli.stages.worlds.task_images import given_pixels, task_images
 from projservo_cli.task.body_pose import NO_BODY, Body, make_body
-from projservo_cli.task.object_bundle_adjustment import ObjectView
+from projservo_cli.task.objects.object_bundle_adjustment import ObjectView
 from projservo_cli.task.target import TaskImages, is_stereo
 
 _UNKNOWN = Ends(np.full((4, 4), np.nan), np.full((4, 4), np.nan), np.full(4, np.nan))

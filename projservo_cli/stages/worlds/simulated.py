@@ -54,7 +54,7 @@ from projservo_cli.stages.worlds.task_images import positioned, task_images
 from projservo_cli.task.body_pose import make_body
 from projservo_cli.task.face import center_of
 from projservo_cli.task.incidences import incidences_of, nearest_goal, points_of
-from projservo_cli.task.object_bundle_adjustment import ObjectView
+from projservo_cli.task.objects.object_bundle_adjustment import ObjectView
 from projservo_cli.task.stand_off import displacement_back
 from projservo_cli.task.target import TaskImages
 

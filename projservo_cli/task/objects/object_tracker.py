@@ -6,8 +6,8 @@ white noise. Source: A. W. Long et al., "The banana distribution is Gaussian", R
 "Estimation with Applications to Tracking and Navigation", 2001, sections 6.2 and 11.
 
 Errors of the shape and of the calibration are the same in all frames. They do not average out, so they are
-no noise of the filter, but a part of what it states. What they leave of each image is learnt, so that views
-agree, and one alone shows the object where it did with the others.
+no noise of the filter, but a part of its stated errors. The residuals that they leave in each image are
+learnt, so that views agree, and one alone shows the object where it did with the others.
 """
 
 import math
@@ -25,9 +25,15 @@ from projservo_cli.findings import LIMITS, REFUSES, Finding, Subject
 from projservo_cli.geometry.displacements import generators
 from projservo_cli.metric.frame import Metric, changes_of
 from projservo_cli.records import MM, BoolArray, Calibration, FloatArray
-from projservo_cli.task.displaced_object import ALIKE_PX, RIGID, CarriedGoal, Displaced, DisplacedObject
-from projservo_cli.task.motion_kind import STILL, MotionKind
-from projservo_cli.task.object_bundle_adjustment import ObjectView
+from projservo_cli.task.objects.displaced_object import (
+    ALIKE_PX,
+    RIGID,
+    CarriedGoal,
+    Displaced,
+    DisplacedObject,
+)
+from projservo_cli.task.objects.motion_kind import STILL, MotionKind
+from projservo_cli.task.objects.object_bundle_adjustment import ObjectView
 
 # Time over which an acceleration lasts, s; radii of an object at which a point accelerates by its rotation
 # as the object does itself: what turns it is mostly wider than it.
@@ -37,15 +43,15 @@ _LASTS_S, _LEVER = 0.1, 4.0
 _UNLIKE, _DISAGREE, _SUDDEN, _BEYOND = 1e-5, 1e-6, 1e-4, 1e-4
 # Chance by which a view that was left out still has to be alike to be used again.
 _ALIKE = 0.05
-# Motion of the images, rms px, by which a step is linearized again, and errors are; most steps.
+# Motion of the images, rms px, by which a step is linearized again, and errors are; maximum number of steps.
 _LINEAR_PX, _ALIKE_WITHIN_PX, _STEPS = 2.0, 20.0, 6
 # Time over which errors are seen to change with the place, s; frames by which their residuals are learnt, at
-# least, and at most.
+# a minimum, and a maximum.
 _AHEAD_S, _LEARNT, _MEMORY = 0.5, 10, 25
 # Time over which what came of a sudden change is held against the largest acceleration, s, and number of
 # frames of the same views by which the motion is known first.
 _JUDGED_S, _FIRST = 0.2, 10
-# Frames by which the kind of a motion is told.
+# Frames by which the kind of a motion is found.
 _LAST = 80
 # Deviations of unknown displacements, in radii of the object and rad, and of its rates, in radii/s and rad/s.
 _WIDE, _FAST, _TURNS = 10.0, 10.0, 1.0
@@ -142,7 +148,7 @@ class _Seen(NamedTuple):
 
 
 class ObjectTracker:
-    """Tracker of an object whose shape and first place looks have shown.
+    """Tracker of an object whose shape and first place frames have shown.
 
     ``covered``: views that the last images left out, since they show no motion of the object, or another
     than the rest; ``pushed``: that it accelerated beyond its limit as all views agree.
@@ -152,14 +158,14 @@ class ObjectTracker:
         self,
         found: DisplacedObject,
         view: Sequence[str],
-        places: Sequence[int],
+        indices: Sequence[int],
         acceleration: float,
         max_acceleration: float,
         name: str,
     ) -> None:
         points, rig = found.markers(found.marker, 0), found.rig
         self.M = found.M  # (k, 4) its markers when taught, in the calibrated frame
-        self._found, self._places = found, list(places)  # of its markers among those of the images
+        self._found, self._indices = found, list(indices)  # of its markers among those of the images
         self._rig, self._view, self._unit_mm = rig, tuple(view), found.unit_mm
         self._of = Subject(markers=found.marker, name=name)
         self._X, self._X_by = points.X, (points.by_images, points.by_calibration)
@@ -180,8 +186,8 @@ class ObjectTracker:
         self._px = float(np.sqrt(np.square(self._shared.by_motion[..., :3]).sum(axis=2).mean()))  # per unit
         per_unit = 1.0 / (self._px if math.isnan(found.unit_mm) else found.unit_mm)
         lever = np.r_[np.ones(3), np.full(g - 3, 1.0 / (_LEVER * self._radius))]
-        self._acceleration, self._most = acceleration * per_unit * lever, max_acceleration * per_unit * lever
-        self._captured, self._shown = np.full(len(view), -math.inf), -math.inf
+        self._acceleration, self._limit = acceleration * per_unit * lever, max_acceleration * per_unit * lever
+        self._captured, self._seen_at = np.full(len(view), -math.inf), -math.inf
         self._left_out = np.zeros(len(view), dtype=bool)
         self._last = _Images(
             np.full((*weight.shape, 2), math.nan), np.zeros(weight.shape), np.zeros(len(view))
@@ -195,33 +201,33 @@ class ObjectTracker:
         cls,
         c: Calibration,
         marker: Sequence[int],
-        looks: Sequence[ObjectView],
+        frames: Sequence[ObjectView],
         *,
         metric: Metric | None = None,
         acceleration: float,
         max_acceleration: float = math.inf,
         name: str = "",
     ) -> Self:
-        """Return the tracker of an object of these looks.
+        """Return the tracker of an object of these frames.
 
-        c, marker, looks, metric : as for ``DisplacedObject.of``, which it raises the errors of.
-        acceleration, max_acceleration : rms and at most, mm/s² with a metric, else px/s². The former of
+        c, marker, frames, metric : as for ``DisplacedObject.of``, which it raises the errors of.
+        acceleration, max_acceleration : rms and maximum, mm/s² with a metric, else px/s². The former of
             changes that last 0.1 s, so in 1 s the speed deviates by 0.3 s times it. Stops and the like are
             found as sudden changes, so it may be small.
         """
-        found = DisplacedObject.of(c, marker, looks, metric)
-        places = [list(marker).index(number) for number in found.marker]
-        return cls(found, c.view, places, acceleration, max_acceleration, name)
+        found = DisplacedObject.of(c, marker, frames, metric)
+        indices = [list(marker).index(number) for number in found.marker]
+        return cls(found, c.view, indices, acceleration, max_acceleration, name)
 
     def observe(self, t: FloatArray, s: FloatArray, sigma: FloatArray | None = None) -> None:
-        """Take images of the views, each of its own time.
+        """Take images of the views, each taken at another time.
 
         t : (V,) capture times, s; a view whose time is not later than before shows nothing new.
         s : (V, k, 2) px, NaN where unseen.
         sigma : (V, k) px; None, or NaN, is as calibrated, and then as residuals scatter.
         """
         self._scatters = sigma is None or not np.isfinite(sigma).any()
-        now = ObjectView(s[:, self._places], None if sigma is None else sigma[:, self._places])
+        now = ObjectView(s[:, self._indices], None if sigma is None else sigma[:, self._indices])
         bundle = self._rig.bundle([now], self._E)
         weight = bundle.weight[0] * ((t > self._captured) & np.isfinite(t))[:, None]
         fresh = (weight > 0.0).sum(axis=1) >= (RIGID if self._rig.rigid else RIGID + 1)
@@ -242,12 +248,12 @@ class ObjectTracker:
             state, seen = state._replace(T=near.T), near
         else:
             if seen.off(used, state.P) > chdtri(len(self._E), _SUDDEN):
-                if self._alike >= _FIRST and math.isfinite(self._most[0]):
+                if self._alike >= _FIRST and math.isfinite(self._limit[0]):
                     self._before = self._before or [(self._earlier, self._state)]
                 state = state._replace(P=state.P + self._sudden(dt))
             self._judge(state.t)
         if (updated := self._updated(state, seen, used, images)) is not None:
-            self._earlier, self._state, self._shown = self._state.t, updated, state.t
+            self._earlier, self._state, self._seen_at = self._state.t, updated, state.t
 
     def at(self, t: float) -> ObjectMotion:
         """Return the motion at a time, s, from the last images on by rates that stay."""
@@ -274,13 +280,13 @@ class ObjectTracker:
 
     def unseen_s(self, t: float) -> float:
         """Time since enough markers were seen last, s."""
-        return t - self._shown
+        return t - self._seen_at
 
     @property
     def kind(self) -> MotionKind:
         """Kind of the motion of the last frames that as many views showed as any; takes some 10 ms."""
-        most = max((views for _, views, _, _ in self._history), default=0)
-        frames = [one for one in self._history if one[1] == most]
+        best = max((views for _, views, _, _ in self._history), default=0)
+        frames = [one for one in self._history if one[1] == best]
         if len(frames) < _FIRST:
             return STILL
         t, _, T, N = (np.array(part) for part in zip(*frames, strict=True))
@@ -311,9 +317,9 @@ class ObjectTracker:
 
     def _sudden(self, dt: float) -> FloatArray:
         """Covariance (2 g, 2 g) that the largest acceleration adds in a time, s."""
-        if not math.isfinite(self._most[0]):
+        if not math.isfinite(self._limit[0]):
             return _by(1.0, 0.0, 0.0, self._size**2) + _by(0.0, 0.0, 1.0, self._fast**2)
-        return _by(dt**4 / 4.0, dt**3 / 2.0, dt**2, self._most**2)
+        return _by(dt**4 / 4.0, dt**3 / 2.0, dt**2, self._limit**2)
 
     def _stepped(self, T: FloatArray, xi: FloatArray) -> FloatArray:
         """Displacement (4, 4) after a step (g,)."""
@@ -335,10 +341,10 @@ class ObjectTracker:
         V, g = len(s), len(self._E)
         bundle = self._rig.bundle([ObjectView(s)] * V, self._E)
         bundle = bundle._replace(weight=weight[None] * np.eye(V)[..., None])
-        places = np.array([self._stepped(T, -one * rates) for one in ago])[None]
-        r, by_point = bundle.residuals(self._X[None], places)
+        poses = np.array([self._stepped(T, -one * rates) for one in ago])[None]
+        r, by_point = bundle.residuals(self._X[None], poses)
         each = np.arange(V)
-        A = bundle.by_motion(by_point, self._X[None], places)[0, each, each].reshape(V, -1, g)
+        A = bundle.by_motion(by_point, self._X[None], poses)[0, each, each].reshape(V, -1, g)
         r = r.reshape(V, V, -1)[each, each]
         root = np.repeat(weight, 2, axis=1)
         new = np.repeat(self._count < _LEARNT, 2, axis=1)
@@ -359,7 +365,7 @@ class ObjectTracker:
     def _near(self, seen: _Seen, fresh: BoolArray, state: _State, images: _Images) -> _Seen:
         """Views against the motion that they show together, if it is far from the prediction.
 
-        Its rates are those on the way there, as uncertain as large.
+        Its rates are those of the motion to there, as uncertain as large.
         """
         dt, total = state.t - self._state.t, np.zeros(len(self._E))
         for _ in range(_STEPS):
@@ -424,15 +430,15 @@ class ObjectTracker:
         seen = self._seen(state.T, state.rates, *self._last._replace(ago=np.where(used, ago, 0.0)))
         N, g = seen.N[used].sum(axis=0), len(self._E)
         P = state.P[:g, :g]
-        size = 0.5 * self._most * (t - since) ** 2
+        size = 0.5 * self._limit * (t - since) ** 2
         W = size[:, None] * (N - N @ P @ np.linalg.solve(np.eye(g) + N @ P, N)) * size
         y = seen.by_itself(used) / size
         if _beyond(W, y) > chdtri(g, _BEYOND):
             known = not math.isnan(self._unit_mm)
             per, unit = (self._unit_mm / MM, "m") if known else (self._px, "px")
             surest = W @ y / np.linalg.norm(W @ y)
-            off, most = (float(per * size[0] * one) for one in (y @ surest, 1.0))
-            found = Finding("pushed_object", REFUSES, self._of, off, limit=most, unit=unit)
+            off, limit = (float(per * size[0] * one) for one in (y @ surest, 1.0))
+            found = Finding("pushed_object", REFUSES, self._of, off, limit=limit, unit=unit)
             self.pushed = self.pushed or found
 
     def _updated(self, state: _State, seen: _Seen, used: BoolArray, images: _Images) -> _State | None:
@@ -441,14 +447,14 @@ class ObjectTracker:
         None if no step leads there, as where few markers leave the motion open.
         """
         g, step = len(self._E), np.zeros(2 * len(self._E))
-        most = _WIDE * np.concatenate([self._size, self._fast])
+        widest = _WIDE * np.concatenate([self._size, self._fast])
         by = [np.hstack([np.eye(g), -ago * np.eye(g)]) for ago in images.ago[used]]
         for _ in range(_STEPS):
             N = sum(M.T @ one @ M for M, one in zip(by, seen.N[used], strict=True))
             b = sum(M.T @ one for M, one in zip(by, seen.b[used], strict=True))
             gain = state.P @ np.linalg.inv(np.eye(2 * g) + N @ state.P)
             last, step = step, gain @ (b + N @ step)
-            if not (np.abs(step) < most).all():
+            if not (np.abs(step) < widest).all():
                 return None
             there, rates = self._stepped(state.T, step[:g]), state.rates + step[g:]
             if self._moved_px((step - last)[:g]) < _LINEAR_PX:
@@ -467,20 +473,20 @@ class ObjectTracker:
     def _learn(self, left: FloatArray, used: BoolArray, weight: FloatArray) -> None:
         """Learn what errors that frames share leave of images, and their noise, from residuals (V, 2 k).
 
-        These are of no motion, so what is learnt takes no part in one that the same views show.
+        These are of no motion, so they take no part in one that the same views show.
         """
-        shown = (weight > 0.0) & used[:, None]
-        # What is not shown is forgotten, since errors change with the place.
-        self._count = np.clip(self._count + np.where(shown, 1, -1), 0, _MEMORY)
-        share = shown / np.maximum(self._count, 1) / np.where(shown, weight, 1.0)
+        detected = (weight > 0.0) & used[:, None]
+        # Residuals of hidden markers are forgotten, since errors change with the place.
+        self._count = np.clip(self._count + np.where(detected, 1, -1), 0, _MEMORY)
+        share = detected / np.maximum(self._count, 1) / np.where(detected, weight, 1.0)
         self._learnt += share[..., None] * left.reshape(self._learnt.shape)
-        if self._scatters and (free := 2 * int(shown.sum()) - len(self._E)) > 0:
+        if self._scatters and (free := 2 * int(detected.sum()) - len(self._E)) > 0:
             times = float(np.square(left[used]).sum()) / free
             sigma = self._rig.sigma_px * math.sqrt(1.0 + (times - 1.0) / _MEMORY)
             self._rig = self._rig._replace(sigma_px=max(sigma, ALIKE_PX))
 
     def _refresh(self, state: _State, weight: FloatArray) -> None:
-        """Find the errors that frames share anew, where it is elsewhere or faster, or more is seen."""
+        """Find again the errors that frames share, where it is elsewhere or faster, or more is seen."""
         last = self._shared
         weight = np.where(weight > 0.0, weight, np.where(self._count > 0, last.weight, 0.0))
         moved = np.sqrt(np.square(self._X @ (state.T - last.T).T).sum(axis=1).mean())
@@ -494,14 +500,14 @@ class ObjectTracker:
     def _shared_at(self, state: _State, weight: FloatArray) -> _Shared:
         """Errors at a state that all frames share, of views of a weight (V, k)."""
         g, shape = len(self._E), (*weight.shape, 2)
-        places = np.stack([state.T, self._stepped(state.T, _AHEAD_S * state.rates)])
-        points = self._X @ places.swapaxes(1, 2)
+        poses = np.stack([state.T, self._stepped(state.T, _AHEAD_S * state.rates)])
+        points = self._X @ poses.swapaxes(1, 2)
         pixels = changes_of(self._rig.pixels(points.reshape(-1, 4)))
         pixels = np.moveaxis(pixels.reshape(-1, shape[0], 2, *shape[1:]), (0, 2), (4, 0))
         bundle = self._rig.bundle([ObjectView(np.zeros(shape), np.ones(weight.shape))] * 2, self._E)
-        by_point = bundle.residuals(self._X[None], places[None])[1]
-        A = bundle.by_motion(by_point, self._X[None], places[None])[0]
-        B = by_point[0] @ places[:, None, None, :, :3]
+        by_point = bundle.residuals(self._X[None], poses[None])[1]
+        A = bundle.by_motion(by_point, self._X[None], poses[None])[0]
+        B = by_point[0] @ poses[:, None, None, :, :3]
         by_images, by_calibration = (np.einsum("lvkdi,kic->lvkdc", B, by, optimize=True) for by in self._X_by)
         pixel = ALIKE_PX * np.eye(math.prod(shape)).reshape(*shape, -1)
         own = np.broadcast_to(pixel, (2, *pixel.shape))

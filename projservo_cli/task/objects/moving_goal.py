@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from projservo_cli.geometry.kinematics import project
 from projservo_cli.records import FloatArray, Model
-from projservo_cli.task.displaced_object import DisplacedObject
-from projservo_cli.task.object_tracker import ObjectMotion, ObjectTracker
+from projservo_cli.task.objects.displaced_object import DisplacedObject
+from projservo_cli.task.objects.object_tracker import ObjectMotion, ObjectTracker
 from projservo_cli.task.target import Place, TaskImages
 
 _STEP = 1e-5  # of a difference, in a coordinate of a motion
@@ -37,8 +37,8 @@ class MovingGoal:
     def at(self, D: FloatArray) -> TaskImages:
         """Start and goal, with the goal displaced by D (4, 4) since the motion was planned."""
         goal = self.images.goal
-        places = tuple(place._replace(s=self._images(D, place)) for place in goal.locations)
-        return self.images._replace(goal=goal._replace(s=self._images(D, Place(goal.s)), locations=places))
+        moved = tuple(place._replace(s=self._images(D, place)) for place in goal.locations)
+        return self.images._replace(goal=goal._replace(s=self._images(D, Place(goal.s)), locations=moved))
 
     def _images(self, D: FloatArray, place: Place) -> FloatArray:
         """Images (V, b, 2) of the body at a place, displaced by D (4, 4); what a fit leaves goes along."""

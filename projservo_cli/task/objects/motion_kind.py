@@ -1,7 +1,7 @@
 """Kinds of motion of an object: at rest, along a line, about an axis, or free, by its places over time.
 
 A motion along a line, or about an axis, is a line in the coordinates of the group, whatever its speed: belts
-and turntables may stop and start again. The likeliest kind is told by Schwarz's criterion.
+and turntables may stop and start again. The likeliest kind is found by Schwarz's criterion.
 """
 
 import math

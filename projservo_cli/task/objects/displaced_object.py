@@ -35,7 +35,7 @@ from projservo_cli.records import (
     IntArray,
     WorkFailed,
 )
-from projservo_cli.task.object_bundle_adjustment import (
+from projservo_cli.task.objects.object_bundle_adjustment import (
     Bundle,
     BundleFit,
     ObjectView,
@@ -47,7 +47,7 @@ from projservo_cli.task.object_bundle_adjustment import (
 
 # Number of markers that six coordinates need, and that twelve need; findings on it by these numbers.
 RIGID, _AFFINE = 3, 4
-# Times of the looks that have to show an object.
+# Times of the observations that have to show an object.
 _TAUGHT, _NOW = "when the goal was taught", "now"
 # Deviation of a turn, rad, or of a stretch, above which it is not seen: first order means nothing there.
 _UNSEEN = 0.3
@@ -67,16 +67,16 @@ _ALONG = 0.95
 
 
 class _Placed(NamedTuple):
-    """Object at the looks that it has been found in."""
+    """Object at the observations that it has been found in."""
 
     fit: BundleFit
-    frames: tuple[int, ...]  # (L,) indices of the looks
+    frames: tuple[int, ...]  # (L,) indices of the observations
     known: BoolArray  # (k,) markers whose points are known
 
 
 @dataclass(frozen=True, eq=False)
 class _Search:
-    """Search for an object in looks at it."""
+    """Search for an object in observations of it."""
 
     rig: ObjectViewRig
     marker: Sequence[int]  # (k,) numbers of its markers
@@ -93,7 +93,7 @@ class _Search:
         return RIGID if self.rig.rigid else _AFFINE
 
     def of(self, markers: BoolArray, name: str = "", at_frame: int | None = None) -> Subject:
-        """Markers (k,) as the subject of a finding, with the time or the number of the look at them."""
+        """Markers (k,) as the subject of a finding, with the time or the number of their observation."""
         poses = () if at_frame is None else (at_frame + 1,)
         return Subject(markers=tuple(np.asarray(self.marker)[markers].tolist()), name=name, poses=poses)
 
@@ -112,7 +112,7 @@ class _Search:
         return X
 
     def found(self) -> _Placed:
-        """The object at all looks that show where it is.
+        """The object at all observations that show where it is.
 
         Raises WorkFailed if the first or the last does not.
         """
@@ -135,7 +135,7 @@ class _Search:
         return placed
 
     def _with(self, placed: _Placed, at_frame: int) -> _Placed:
-        """The object with one more look at it."""
+        """The object with one more observation of it."""
         when = _TAUGHT if at_frame == 0 else _NOW
         X = np.full((len(self.marker), 4), np.nan)
         X[placed.known] = placed.fit.X
@@ -177,7 +177,7 @@ class _Search:
         return [X, reversed_]
 
     def _joined(self, placed: _Placed, at_frame: int, X: FloatArray, there: FloatArray) -> _Placed:
-        """The minimum with one more look, from points (k, 4) and their displacement (4, 4) there."""
+        """The minimum with one more observation, from points (k, 4) and their displacement (4, 4) there."""
         at = sorted([*zip(placed.frames, placed.fit.T, strict=True), (at_frame, there)], key=itemgetter(0))
         frames = tuple(i for i, _ in at)
         points = np.where(placed.known[:, None], X, self.points(at_frame, there))
@@ -278,7 +278,7 @@ def _by_motion(rig: ObjectViewRig, fit: BundleFit, tag: Sequence[int]) -> FloatA
 def _of_one_object(
     rig: ObjectViewRig, marker: Sequence[int], frames: Sequence[ObjectView]
 ) -> tuple[BundleFit, BoolArray, tuple[int, ...]]:
-    """The object as found in looks, its markers (k,) that are known, and numbers of those that were left out.
+    """The object as observed, its markers (k,) that are known, and numbers of those that were left out.
 
     A single outlier in one frame, as a finder errs at a covered edge, is left out of that frame,
     one of ``_SHARE`` seen at most. Raises WorkFailed if more err: that is another object.
@@ -319,7 +319,7 @@ def images_by_motion(c: Calibration, s: FloatArray) -> FloatArray:
 
 
 class Displaced(NamedTuple):
-    """Displacement T B of an object since a goal was taught on it, in the frame of looks, with its errors.
+    """Displacement T B of an object since a goal was taught on it, in their frame, with its errors.
 
     They are steps T exp(ξ E), by independent errors of unit variance.
     """
@@ -366,7 +366,7 @@ class CarriedGoal:
 
 @dataclass(frozen=True, eq=False)
 class DisplacedObject:
-    """Object as found in looks at it, the first when a goal was taught on it, the last now."""
+    """Object as found in observations of it, the first when a goal was taught on it, the last now."""
 
     marker: tuple[int, ...]  # numbers of the markers that it was found by
     M: FloatArray  # (k, 4) them when the goal was taught, in the calibrated frame, a_inf·M = 1
@@ -389,10 +389,10 @@ class DisplacedObject:
     def of(
         cls, c: Calibration, marker: Sequence[int], frames: Sequence[ObjectView], metric: Metric | None = None
     ) -> Self:
-        """Find the displacement of an object by all looks at it.
+        """Find the displacement of an object by all observations of it.
 
         Looks in between refine its shape; those that do not show where it is are left out. A marker counts
-        if two views or more see it at some look.
+        if two views or more see it at some observation.
 
         c : calibration with its covariance.
         marker : (k,) numbers of the markers of the object, as messages name them.
@@ -427,9 +427,9 @@ class DisplacedObject:
             _fit=fit,
         )
 
-    def markers(self, numbers: Sequence[int], look: int = -1) -> UncertainPoints:
-        """Return some of its markers (k,) at a look, NaN where unseen, in the frame of the looks."""
-        found = self._fit.points_at(range(len(self._fit.T))[look], self.rig)
+    def markers(self, numbers: Sequence[int], frame: int = -1) -> UncertainPoints:
+        """Return some of its markers (k,) at an observation, NaN where unseen, in their common frame."""
+        found = self._fit.points_at(range(len(self._fit.T))[frame], self.rig)
         at = [self.marker.index(number) if number in self.marker else -1 for number in numbers]
         unseen = np.array(at) < 0
         return UncertainPoints(
@@ -441,7 +441,7 @@ class DisplacedObject:
 
         goal : images (V, m, 2) of the markers of the tool there, px, in the order of the calibration; NaN
             where unseen.
-        at : where the object is; None for the last look.
+        at : where the object is; None for the last observation.
         Raises WorkFailed if they do not determine a pose of the tool, or the carried one is out of sight.
         """
         rig, at = self.rig, self._now() if at is None else at
@@ -486,7 +486,7 @@ class DisplacedObject:
         )
 
     def _now(self) -> Displaced:
-        """Displacement to the last look, with its errors."""
+        """Displacement to the last observation, with its errors."""
         fit = self._fit
         by_images, by_calibration = fit.errors(self.rig, fit.X)
         xi, xi_c = np.zeros((2, len(fit.bundle.E), 1))

@@ -1,0 +1,1 @@
+"""Objects that goals are taught on: found again, and tracked while they move."""
