@@ -120,6 +120,7 @@ class LeastSquares:
     curve_terms: int = 0  # number of terms of the curve of the joints
     by_twist: FloatArray | None = None  # (K, n, n) of ``q`` by a twist of the flange; None for joints
     stated: StatedIntrinsics | None = None  # intrinsics as priors, where there are any
+    term_spread: float | None = None  # deviation of the curve's terms from zero, over pixel noise, as a prior
 
     @classmethod
     def of(
@@ -153,7 +154,7 @@ class LeastSquares:
     def alike(self, detections: Detections) -> "LeastSquares":
         """Problem of the same parameters but for markers, of other detections, without noise of joints."""
         there = LeastSquares.of(detections, self.q_reference, self.lens_terms, self.curve_terms)
-        return dataclasses.replace(there, stated=self.stated)
+        return dataclasses.replace(there, stated=self.stated, term_spread=self.term_spread)
 
     def joints(self, params: Parameters) -> FloatArray:
         """Readings (K, n) from the reference, rad or m, with the offsets if joint readings have noise."""
@@ -170,17 +171,23 @@ class LeastSquares:
         return np.zeros_like(self.q) if params.offsets is None else np.asarray(params.offsets / self.tau)
 
     def departure(self, params: Parameters) -> FloatArray:
-        """Entries (V, 5) of intrinsics less those stated, over their spread, px; (0, 5) without any."""
-        if self.stated is None:
-            return np.zeros((0, 5))
-        return np.asarray((intrinsics_of(params.P) - self.stated.K)[:, *UPPER] / self.stated.spread)
+        """Intrinsics less those stated (5 V,), then terms of the curve (T,), over their spread, px."""
+        parts = [np.zeros(0)]
+        if self.stated is not None:
+            off = (intrinsics_of(params.P) - self.stated.K)[:, *UPPER] / self.stated.spread
+            parts.append(off.ravel())
+        if self.term_spread is not None and params.curve is not None:
+            parts.append(params.curve.terms[:, 3] / self.term_spread)
+        return np.concatenate(parts)
 
     def departure_derivative(self, params: Parameters) -> FloatArray:
-        """Derivatives (5 V, shared) of ``departure`` by the shared parameters."""
+        """Derivatives (d, shared) of ``departure`` by the shared parameters."""
         result = np.zeros((self.departure(params).size, self.shared))
         if self.stated is not None:
             by_camera = intrinsics_derivative(params.P) / self.stated.spread[..., None]
-            result[:, : params.P.size] = block_diag(*by_camera)
+            result[: self.stated.spread.size, : params.P.size] = block_diag(*by_camera)
+        if self.term_spread is not None:
+            result[-self.curve_terms :, self.curved] = np.eye(self.curve_terms) / self.term_spread
         return result
 
     def prior_squares(self, params: Parameters) -> float:
@@ -206,6 +213,7 @@ class LeastSquares:
     def free(self) -> int:
         """Number of parameters that move images, those of the frame included, less what is stated of them."""
         known = 0 if self.stated is None else int(np.isfinite(self.stated.spread).sum())
+        known += 0 if self.term_spread is None else self.curve_terms
         return self.size - 3 * int(np.count_nonzero(self.detections.on_board)) - known
 
     @property
@@ -538,7 +546,7 @@ class _Expansion:
         self.root, self.first = np.sqrt(weight), problem.size - len(min_scale)
         m, offsets = len(params.M), 0 if problem.tau is None else problem.q.size
         self.by_pose = problem.by_pose
-        self.strain, self.departure = problem.strain(params), problem.departure(params).ravel()
+        self.strain, self.departure = problem.strain(params), problem.departure(params)
         self.stated = problem.departure_derivative(params)
         self.known: list[_Part] = []
         s, size = problem.shared, 3 * m if self.by_pose else offsets
@@ -646,7 +654,7 @@ class _Expansion:
         return self._whole(velocity + 0.5 * acceleration)
 
     def solved(self, damping: float) -> Callable[[FloatArray, FloatArray, FloatArray], FloatArray] | None:
-        """Solver that maps a change (V, N, 2) of images, strains (K, n) and departures (5 V,) to a step.
+        """Solver that maps a change (V, N, 2) of images, strains (K, n) and departures (d,) to a step.
 
         The step undoes them, in units. None if the normal matrix is singular.
         """

@@ -13,13 +13,25 @@ from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 from projservo_cli.calibration.bundle_adjustment import LeastSquares
 from projservo_cli.calibration.checks.model_errors import suspected
 from projservo_cli.calibration.detections import MAX_JUDGED, per_rad
 from projservo_cli.calibration.initial.epipolar import ImageGeometry
-from projservo_cli.calibration.robust_fit import Solution, fit_from, left_out_errors, left_out_px
+from projservo_cli.calibration.joint_noise import SIGNIFICANT
+from projservo_cli.calibration.prediction import Parameters
+from projservo_cli.calibration.robust_fit import (
+    Expected,
+    Solution,
+    fit_from,
+    fit_inliers,
+    fit_joint_noise,
+    left_out_errors,
+    left_out_px,
+)
 from projservo_cli.deviations import ARGUMENTS, BASIS, CURVES, DEVIATIONS, PAIR
+from projservo_cli.findings import LIMITS, Finding
 from projservo_cli.geometry.joint_curve import basis, slopes, torques
 from projservo_cli.messages.placeholders import quantity
 from projservo_cli.records import (
@@ -52,7 +64,8 @@ _BENDS = np.radians(5.0)
 _FOLDS = 0.2
 # Rounds of the search for the direction of gravity, and the usual deflection, rad, which keeps it finite.
 _ROUNDS, _USUAL_SAG = 20, np.radians(0.5)
-
+# Least and largest share by which positions of the flange err with its place; the latter is the wide prior.
+_LEAST, _WIDE = 1e-5, 0.02
 
 _Term = tuple[int, int, int]  # index of the function, joint moved and joint read
 
@@ -112,16 +125,17 @@ def hypotheses_of(asked: str | Iterable[str], joint_types: str, mount: str) -> l
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class _JointModelFit:
+class JointModelFit:
     """A fit with a curve of the joints."""
 
     solution: Solution
     gains: FloatArray  # (T, 2) typical error at left-out poses, px, without and with each term
+    findings: tuple[Finding, ...] = ()
 
 
 def fit_joint_model(
     start: Solution, asked: Sequence[Hypothesis] | None, epipolar: ImageGeometry
-) -> _JointModelFit | None:
+) -> JointModelFit | None:
     """Fit the curve of the hypotheses asked for, or for None of those that the data show.
 
     None if they show none. Raises WorkFailed naming a hypothesis that the data do not determine.
@@ -150,7 +164,61 @@ def fit_joint_model(
     now = left_out_px(found)
     owners = _terms(chosen, exact)
     without = {key: before.get(one, left_out_px(exact)) for one in chosen for key in owners[one]}
-    return _JointModelFit(found, np.array([[without[key], now] for key in _keys(found.params.curve)]))
+    return JointModelFit(found, np.array([[without[key], now] for key in _keys(found.params.curve)]))
+
+
+def fit_errors_of_place(start: Solution, expected: Expected) -> JointModelFit | None:
+    """Fit errors of positions of the flange that are a linear map of its place, with a normal prior.
+
+    The deviation of the nine terms is that of maximum marginal likelihood. None if the images do not show
+    them, by the test of the noise of joints, or if the noise of poses is exact, given or not shown.
+    """
+    detections, noise = start.problem.detections, start.joint_noise
+    shown = noise is not None and noise.interval is not None and noise.sigma_q > 0.0
+    if detections.chart is None or start.params.curve is not None or not shown:
+        return None
+    slides = np.flatnonzero(start.params.prismatic)
+    terms = np.array([(BASIS.index("linear"), i, j, 0.0) for i in slides for j in slides])
+    bare = LeastSquares.of(detections, start.problem.q_reference, start.problem.lens_terms, len(terms))
+    params = dataclasses.replace(start.params, curve=NO_CURVE._replace(terms=terms))
+
+    def fitted(near: Solution, params: Parameters, size: float) -> Solution | None:
+        """Fit with terms of a size, at the noise of poses of a fit near it."""
+        spread = size / max(near.sigma_px, 1e-9)
+        problem = dataclasses.replace(bare, tau=near.problem.tau, term_spread=spread)
+        return fit_inliers(problem, params, near.sigma_px, min_px=expected.min_px or 1e-9)
+
+    if (wide := fitted(start, params, _WIDE)) is None:
+        return None
+    wide = fit_joint_noise(wide, expected, None)
+    size, gain = _size_of_terms(wide)
+    found = fitted(wide, wide.params, size) if gain > SIGNIFICANT else None
+    if found is None:
+        return None
+    found = dataclasses.replace(found, joint_noise=wide.joint_noise)
+    gains = np.tile([left_out_px(start), left_out_px(found)], (len(terms), 1))
+    return JointModelFit(found, gains, (Finding("errors_of_place", LIMITS, amount=size, unit="m"),))
+
+
+def _size_of_terms(wide: Solution) -> tuple[float, float]:
+    """Deviation of terms by marginal likelihood from a fit with a wide prior, and the deviance that it saves.
+
+    A direction that the images leave open, as the scale of all positions, has no information.
+    """
+    problem, px = wide.problem, wide.sigma_px
+    rows, terms = wide.errors().shared[problem.curved], (wide.params.curve or NO_CURVE).terms[:, 3]
+    inverse = np.linalg.inv(px**2 * rows @ rows.T)
+    by_prior = np.eye(len(rows)) / (px * (problem.term_spread or np.inf)) ** 2
+    information, V = np.linalg.eigh(inverse - by_prior)
+    information, square = np.maximum(information, 0.0), (V.T @ inverse @ terms) ** 2
+
+    def deviance(log_size: float) -> float:
+        """Deviance of a size, less that of none."""
+        s = np.exp(2.0 * log_size)
+        return float((np.log1p(s * information) - square * s / (1.0 + s * information)).sum())
+
+    best = minimize_scalar(deviance, bounds=(np.log(_LEAST), np.log(_WIDE)), method="bounded")
+    return float(np.exp(best.x)), -float(best.fun)
 
 
 def _keys(curve: JointCurve) -> list[_Term]:

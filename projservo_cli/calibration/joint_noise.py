@@ -45,7 +45,7 @@ _SHARE = 0.001
 # Information of a direction, over the best known direction, below which images leave it open.
 _OPEN = 1e-12
 # Deviance that χ² exceeds by chance in 1 of 100 cases at the border of the parameters: Self and Liang.
-_SIGNIFICANT = 5.412
+SIGNIFICANT = 5.412
 # Deviance at the ends of a 95 % interval, χ² of one degree of freedom.
 _INTERVAL = 3.841
 # Probability of the bound on the difference of fits without and with noise.
@@ -132,7 +132,7 @@ class JointNoise:
             high = likelihood.sigma_q(brentq(beyond, log_ratio, log_ratios[-1]))
         if high >= _MAX_SIGMA_Q:  # a wrong model asks for any amount of noise
             return NO_JOINT_NOISE
-        if none - minimum <= _SIGNIFICANT:
+        if none - minimum <= SIGNIFICANT:
             return cls(0.0, np.array([0.0, high]), 0.0)
         if likelihood.contradicted(log_ratio):
             return NO_JOINT_NOISE

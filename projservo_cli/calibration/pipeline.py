@@ -50,7 +50,13 @@ from projservo_cli.calibration.initial.camera_resection import with_all_views
 from projservo_cli.calibration.initial.camera_weights import with_own_noise
 from projservo_cli.calibration.initial.epipolar import ImageFrame, ImageGeometry
 from projservo_cli.calibration.initial.initialization import Nominal, Progress, Search
-from projservo_cli.calibration.joint_model import AUTO, Hypothesis, fit_joint_model, hypotheses_of
+from projservo_cli.calibration.joint_model import (
+    AUTO,
+    Hypothesis,
+    fit_errors_of_place,
+    fit_joint_model,
+    hypotheses_of,
+)
 from projservo_cli.calibration.known_intrinsics import KnownCameras, with_known_intrinsics
 from projservo_cli.calibration.known_shape import with_known_shapes
 from projservo_cli.calibration.lens_estimation import fit_lens, share_explained, undistorted
@@ -298,9 +304,12 @@ def _maximum_likelihood(
             curved = fit_joint_model(solution, curves, epipolar)
             solution = solution if curved is None else curved.solution
         solution = fit_joint_noise(solution, expected, search.joint_noise)
+        if curves == [] and (curved := fit_errors_of_place(solution, expected)) is not None:
+            solution, of_stated = curved.solution, [*curved.findings]
         if boards:
             search.progress("calibration, boards", 0, 1)
-            solution, boards, of_stated = with_known_shapes(solution, boards, expected)
+            solution, boards, of_boards = with_known_shapes(solution, boards, expected)
+            of_stated += of_boards
         if cameras is not None:
             solution, of_cameras = with_known_intrinsics(solution, cameras, expected)
             of_stated += of_cameras

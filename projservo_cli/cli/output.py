@@ -138,7 +138,7 @@ def _of_calibration(value: dict[str, Any], detailed: bool) -> Iterator[str]:
     asked = (
         detailed
         or value["lens"]
-        or value.get("joint_model")
+        or (value.get("joint_model") and value["readings"] != "flange")
         or value.get("cross_validation")
         or len(value["joints"]) == 1
         or value["predicted_rms_px"] is None

@@ -96,6 +96,11 @@ CALIBRATION = {
         "look whether the file is of this camera, and of this zoom, focus and size of images",
         limit="the {view} camera, which is not as its file",
     ),
+    "errors_of_place": Row(
+        "positions of the flange err by {amount} a metre of place, which is taken into account",
+        "calibrate the kinematics of the arm where predictions are to be more exact",
+        limit="positions of the flange, which err with its place",
+    ),
     "other_pitch": Row(
         "squares of the board {name} are {pitches}",
         "measure the board, and look at the unit and the scale of the readings",
