@@ -64,8 +64,10 @@ _BENDS = np.radians(5.0)
 _FOLDS = 0.2
 # Rounds of the search for the direction of gravity, and the usual deflection, rad, which keeps it finite.
 _ROUNDS, _USUAL_SAG = 20, np.radians(0.5)
-# Least and largest share by which positions of the flange err with its place; the latter is the wide prior.
+# Least and largest deviation of terms by which positions of the flange err with its place.
 _LEAST, _WIDE = 1e-5, 0.02
+# Deviation above which such terms are a fault of the table, that score tests name: a scale of 2 % has 0.6 %.
+_FAULT = 5e-3
 
 _Term = tuple[int, int, int]  # index of the function, joint moved and joint read
 
@@ -171,7 +173,7 @@ def fit_errors_of_place(start: Solution, expected: Expected) -> JointModelFit | 
     """Fit errors of positions of the flange that are a linear map of its place, with a normal prior.
 
     The deviation of the nine terms is that of maximum marginal likelihood. None if the images do not show
-    them, by the test of the noise of joints, or if the noise of poses is exact, given or not shown.
+    them, by the test of the noise of joints, if they are a fault, or if no noise of poses shows.
     """
     detections, noise = start.problem.detections, start.joint_noise
     shown = noise is not None and noise.interval is not None and noise.sigma_q > 0.0
@@ -192,7 +194,7 @@ def fit_errors_of_place(start: Solution, expected: Expected) -> JointModelFit | 
         return None
     wide = fit_joint_noise(wide, expected, None)
     size, gain = _size_of_terms(wide)
-    found = fitted(wide, wide.params, size) if gain > SIGNIFICANT else None
+    found = fitted(wide, wide.params, size) if gain > SIGNIFICANT and size < _FAULT else None
     if found is None:
         return None
     found = dataclasses.replace(found, joint_noise=wide.joint_noise)

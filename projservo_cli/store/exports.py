@@ -12,7 +12,7 @@ from projservo_cli.geometry.displacements import rigid_inverse
 from projservo_cli.image_size import ImageSize, image_sizes
 from projservo_cli.metric.frame import Metric
 from projservo_cli.metric.opencv import OpenCV
-from projservo_cli.records import TOOL, VIEWS, FloatArray, InputError
+from projservo_cli.records import NO_CURVE, TOOL, VIEWS, FloatArray, InputError
 from projservo_cli.store.camera_files import camera_info
 
 # Limits of a URDF joint that no calibration knows: N m or N, and rad/s or m/s.
@@ -144,8 +144,18 @@ def _fixed(parent: str, link: str, T: FloatArray) -> list[str]:
     ]
 
 
+def _errors_of_place(metric: Metric) -> dict[str, Any]:
+    """Map A (3, 3) by which positions of the flange err, p + A (p − c), and c (3,), m; none without."""
+    terms = NO_CURVE.terms if metric.curve is None else metric.curve.terms
+    if not metric.by_flange or not len(terms) or terms[:, 0].any() or terms[:, 1:3].max() > 2:
+        return {}
+    A = np.zeros((3, 3))
+    A[*terms[:, 1:3].astype(np.int64).T] = terms[:, 3]
+    return {"errors_of_place": A.tolist(), "place": metric.pose(metric.q_reference)[:3, 3].tolist()}
+
+
 def _require_ideal(metric: Metric, kind: str) -> None:
-    if metric.curve is not None:
+    if metric.curve is not None and not _errors_of_place(metric):
         joints = ", ".join(map(str, np.unique(metric.curve.terms[:, 1].astype(int) + 1)))
         raise InputError(
             f"export: joints {joints} of the calibration turn by a curve of their readings, which a {kind} "
@@ -186,4 +196,4 @@ def to_json(metric: Metric, more: Mapping[str, Any]) -> str:
     about: dict[str, Any] = {"joint_types": metric.joint_types, "marker": metric.marker, "tool": tool}
     if metric.view != VIEWS:
         about["view"] = metric.view
-    return json.dumps({**about, **arrays, **covariances, **more}, indent=1, allow_nan=False) + "\n"
+    return json.dumps({**about, **arrays, **covariances, **_errors_of_place(metric), **more}, indent=1, allow_nan=False) + "\n"

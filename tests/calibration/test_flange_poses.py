@@ -2,12 +2,14 @@
 
 import json
 import shutil
+from unittest import mock
 
 import numpy as np
 import pytest
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
+from projservo_cli.calibration import pipeline
 from projservo_cli.calibration.pipeline import calibrate
 from projservo_cli.calibration.prediction import predict
 from projservo_cli.geometry.displacements import cross_matrix, rigid, rigid_inverse
@@ -82,6 +84,57 @@ def test_errors_of_poses_have_a_place_and_a_turn(mount):
     assert found.sigma_flange_m == pytest.approx(2e-3, rel=0.35)
     assert found.sigma_q == pytest.approx(1e-3, rel=0.35)
     assert found.fit.sigma_fitted_px == pytest.approx(0.2, rel=0.1)
+
+
+def of_an_arm(rng, size, count=16):
+    """Poses as read, a map of their places, and images of ten corners at these and at new poses.
+
+    The true poses err by 0.3 mm and 1 mrad too, and pixels by 0.1.
+    """
+    A, read, there = size * rng.standard_normal((3, 3)), poses(rng, count), poses(rng, 40)
+    for T in (read, there):  # in a larger space
+        T[:, :3, 3] += T[:, :3, 3] - [0.5, 0.0, 0.45]
+    true = [T.copy() for T in (read, there)]
+    for T in true:
+        T[:, :3, 3] += (T[:, :3, 3] - [0.5, 0.0, 0.45]) @ A.T
+    turns = Rotation.from_rotvec(1e-3 * rng.standard_normal((count, 3)))
+    noise = [rigid(R, t) for R, t in zip(turns, 3e-4 * rng.standard_normal((count, 3)), strict=True)]
+    seen = images(true[0] @ np.array(noise), WORLD, rng, 0.1)[:, :, ::5]
+    return read, seen, there, images(true[1], WORLD, rng, 0.0)[:, :, ::5]
+
+
+def error_at(found, there, seen):
+    """Squared errors (K,) of predicted images at poses, over their stated mean."""
+    chart = FlangeChart.from_record(found.flange_chart)
+    error = predict(found, chart.coordinates(there)) - seen
+    return float(np.mean(np.sum(error**2, axis=-1)) / found.predicted_rms_px**2)
+
+
+def test_errors_of_positions_with_their_place_are_fitted_within_their_prior():
+    """Of 2 per thousand: new images err less than without, and as stated."""
+    ratios, gains = [], []
+    for seed in range(4):
+        read, seen, there, truth = of_an_arm(np.random.default_rng([7, seed]), 2e-3, 40)
+        found = fitted(read, seen, WORLD)
+        said = [one for one in found.findings if one.code == "errors_of_place"]
+        assert len(said) == 1
+        assert 1e-3 < said[0].amount < 4e-3  # nine normal terms show it to a quarter
+        ratios.append(error_at(found, there, truth))
+        squared = ratios[-1] * found.predicted_rms_px**2
+        with mock.patch.object(pipeline, "fit_errors_of_place", return_value=None):
+            plain = fitted(read, seen, WORLD)
+        gains.append(squared / (error_at(plain, there, truth) * plain.predicted_rms_px**2))
+    assert np.mean(ratios) < 1.5
+    assert np.median(gains) < 0.7
+
+
+def test_poses_without_such_errors_are_calibrated_as_before():
+    """One of eight may show them by chance: 1 in 100 do, at the border of the test."""
+    taken = [
+        fitted(*of_an_arm(np.random.default_rng([8, seed]), 0.0)[:2], WORLD).joint_curve is not None
+        for seed in range(8)
+    ]
+    assert sum(taken) <= 1
 
 
 def inverse(T):

@@ -135,7 +135,7 @@ KINDS = {
     "rounding": (lambda T, rng, mount: pose_columns(rounded(T)), set()),
     "one scale": (
         lambda T, rng, mount: pose_columns(scaled(T, rng.integers(3), 1.02)),
-        {"scale", "other_pitch"},
+        {"scale", "other_pitch", "errors_of_place"},
     ),
     "shifted": (None, {"images_after_readings", "images_before_readings"}),
     "base moved": (
