@@ -19,11 +19,12 @@ from projservo_cli.calibration.bundle_adjustment import LeastSquares
 from projservo_cli.calibration.checks.model_errors import suspected
 from projservo_cli.calibration.detections import MAX_JUDGED, per_rad
 from projservo_cli.calibration.initial.epipolar import ImageGeometry
-from projservo_cli.calibration.joint_noise import SIGNIFICANT
+from projservo_cli.calibration.joint_noise import NO_JOINT_NOISE, SIGNIFICANT
 from projservo_cli.calibration.prediction import Parameters
 from projservo_cli.calibration.robust_fit import (
     Expected,
     Solution,
+    by_usual_noise,
     fit_from,
     fit_inliers,
     fit_joint_noise,
@@ -172,17 +173,19 @@ def fit_joint_model(
 def fit_errors_of_place(start: Solution, expected: Expected) -> JointModelFit | None:
     """Fit errors of positions of the flange that are a linear map of its place, with a normal prior.
 
-    The deviation of the nine terms is that of maximum marginal likelihood. None if the images do not show
-    them, by the test of the noise of joints, if they are a fault, or if no noise of poses shows.
+    The deviation of the nine terms is that of maximum marginal likelihood. Noise of poses that contradicts
+    images, as such errors do, is estimated with the terms. None if the images do not show them, by the test
+    of the noise of joints, if they are a fault, or if the noise of poses is given or none.
     """
     detections, noise = start.problem.detections, start.joint_noise
-    shown = noise is not None and noise.interval is not None and noise.sigma_q > 0.0
-    if detections.chart is None or start.params.curve is not None or not shown:
+    given_or_none = noise is None or (noise.sigma_q > 0.0) != (noise.interval is not None)
+    if detections.chart is None or start.params.curve is not None or given_or_none:
         return None
+    near = by_usual_noise(start, expected) if start.problem.tau is None else start
     slides = np.flatnonzero(start.params.prismatic)
     terms = np.array([(BASIS.index("linear"), i, j, 0.0) for i in slides for j in slides])
     bare = LeastSquares.of(detections, start.problem.q_reference, start.problem.lens_terms, len(terms))
-    params = dataclasses.replace(start.params, curve=NO_CURVE._replace(terms=terms))
+    params = dataclasses.replace(near.params, curve=NO_CURVE._replace(terms=terms))
 
     def fitted(near: Solution, params: Parameters, size: float) -> Solution | None:
         """Fit with terms of a size, at the noise of poses of a fit near it."""
@@ -190,9 +193,11 @@ def fit_errors_of_place(start: Solution, expected: Expected) -> JointModelFit | 
         problem = dataclasses.replace(bare, tau=near.problem.tau, term_spread=spread)
         return fit_inliers(problem, params, near.sigma_px, min_px=expected.min_px or 1e-9)
 
-    if (wide := fitted(start, params, _WIDE)) is None:
+    if (wide := fitted(near, params, _WIDE)) is None:
         return None
     wide = fit_joint_noise(wide, expected, None)
+    if wide.joint_noise is NO_JOINT_NOISE:
+        return None
     size, gain = _size_of_terms(wide)
     found = fitted(wide, wide.params, size) if gain > SIGNIFICANT and size < _FAULT else None
     if found is None:

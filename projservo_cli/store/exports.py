@@ -196,4 +196,9 @@ def to_json(metric: Metric, more: Mapping[str, Any]) -> str:
     about: dict[str, Any] = {"joint_types": metric.joint_types, "marker": metric.marker, "tool": tool}
     if metric.view != VIEWS:
         about["view"] = metric.view
-    return json.dumps({**about, **arrays, **covariances, **_errors_of_place(metric), **more}, indent=1, allow_nan=False) + "\n"
+    return (
+        json.dumps(
+            {**about, **arrays, **covariances, **_errors_of_place(metric), **more}, indent=1, allow_nan=False
+        )
+        + "\n"
+    )

@@ -1,5 +1,6 @@
 """Poses of the flange instead of joint readings."""
 
+import dataclasses
 import json
 import shutil
 from unittest import mock
@@ -17,6 +18,7 @@ from projservo_cli.geometry.flange import FLANGE_TYPES, FlangeChart
 from projservo_cli.observations import Observations
 from projservo_cli.records import TOOL, WORLD, InputError, Observation, WorkFailed
 from projservo_cli.results import ImageModel
+from projservo_cli.store.exports import to_json, urdf
 from projservo_cli.store.observation_tables import read_detections, read_joint_list
 from tests.calibration.flange import HAND, K, images, poses
 from tests.conftest import SHARED
@@ -110,26 +112,31 @@ def error_at(found, there, seen):
     return float(np.mean(np.sum(error**2, axis=-1)) / found.predicted_rms_px**2)
 
 
-def test_errors_of_positions_with_their_place_are_fitted_within_their_prior():
-    """Of 2 per thousand: new images err less than without, and as stated."""
-    ratios, gains = [], []
-    for seed in range(4):
+def test_errors_of_positions_with_their_place_are_fitted_and_stated():
+    """Of 2 per thousand by 40 poses: new images err as stated, twice as little as by noise of poses alone.
+
+    One of three maps contradicts noise of poses alone, which is then refused.
+    """
+    stated, gains = [], []
+    for seed in range(1, 4):
         read, seen, there, truth = of_an_arm(np.random.default_rng([7, seed]), 2e-3, 40)
         found = fitted(read, seen, WORLD)
-        said = [one for one in found.findings if one.code == "errors_of_place"]
-        assert len(said) == 1
-        assert 1e-3 < said[0].amount < 4e-3  # nine normal terms show it to a quarter
-        ratios.append(error_at(found, there, truth))
-        squared = ratios[-1] * found.predicted_rms_px**2
+        said = [one.amount for one in found.findings if one.code == "errors_of_place"]
+        assert said == [pytest.approx(2e-3, rel=0.6)]  # of nine normal terms, some hidden by noise
+        stated.append(error_at(found, there, truth))
         with mock.patch.object(pipeline, "fit_errors_of_place", return_value=None):
-            plain = fitted(read, seen, WORLD)
-        gains.append(squared / (error_at(plain, there, truth) * plain.predicted_rms_px**2))
-    assert np.mean(ratios) < 1.5
-    assert np.median(gains) < 0.7
+            try:
+                plain = fitted(read, seen, WORLD)
+            except WorkFailed:
+                continue
+        squares = [one.predicted_rms_px**2 for one in (found, plain)]
+        gains.append(stated[-1] * squares[0] / (error_at(plain, there, truth) * squares[1]))
+    assert np.mean(stated) < 1.5
+    assert np.mean(gains) < 0.6
 
 
 def test_poses_without_such_errors_are_calibrated_as_before():
-    """One of eight may show them by chance: 1 in 100 do, at the border of the test."""
+    """At most one of eight shows them by chance, where the test lets 1 of 100: p = 0.003."""
     taken = [
         fitted(*of_an_arm(np.random.default_rng([8, seed]), 0.0)[:2], WORLD).joint_curve is not None
         for seed in range(8)
@@ -255,6 +262,29 @@ def test_real_poses_are_calibrated_with_their_errors():
     assert found.fit.sigma_fitted_px < 0.1
     assert 5e-4 < found.sigma_q < 2e-3
     assert 1e-4 < found.sigma_flange_m < 1e-3
+    said = [one.amount for one in found.findings if one.code == "errors_of_place"]
+    assert said == [pytest.approx(1.9e-3, rel=0.1)]
+    metric = ImageModel.of(found).metric()
+    held = json.loads(to_json(metric, {}))
+    read = FlangeChart.from_record(found.flange_chart).poses(seen.q)[:, :3, 3]
+    moved = read + (read - held["place"]) @ np.transpose(held["errors_of_place"])
+    np.testing.assert_allclose(metric.pose(seen.q)[:, :3, 3], moved, atol=1e-12)
+    assert "floating" in urdf(metric, [], np.zeros((0, 2)))
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="no data of others beside the project")
+def test_real_poses_predict_left_out_images():
+    """The third of four folds: by 1.64 px, and without errors of places by 2.01; all by 1.35 and 1.51."""
+    data = SHARED / "charuco_poses"
+    seen = read_detections(data / "detections.csv", data / "poses.csv")
+    left = np.arange(len(seen.q)) % 4 == 2
+    some = dataclasses.replace(seen, pose=seen.pose[~left], q=seen.q[~left], images=seen.images[~left])
+    found = calibrate(
+        some, FLANGE_TYPES, source="recorded", joint_noise=None, lens=True, image_size=(1600, 1200)
+    )
+    there = np.searchsorted(seen.marker, found.marker)
+    error = predict(found, seen.q[left]) - seen.images[left][:, :, there]
+    assert np.sqrt(np.nanmean(np.sum(error**2, axis=-1))) < 1.75
 
 
 def test_observations_take_poses_and_join_them():
