@@ -11,7 +11,15 @@ from projservo_cli.calibration.initial.epipolar import Epipolar, ImageFrame, Ima
 from projservo_cli.calibration.initial.initialization import Search
 from projservo_cli.calibration.initial.single_view import RigidBody
 from projservo_cli.calibration.prediction import LENS, Parameters
-from projservo_cli.calibration.robust_fit import Solution, fit_from, left_out_px
+from projservo_cli.calibration.robust_fit import (
+    Expected,
+    Solution,
+    fit_from,
+    fit_inliers,
+    fit_joint_noise,
+    left_out_px,
+)
+from projservo_cli.geometry.invariant_forms import intrinsics_of
 from projservo_cli.geometry.lens import before_fold, undistort
 from projservo_cli.records import FloatArray, WorkFailed
 
@@ -21,8 +29,12 @@ _MIN_SHARE = 0.02
 _TAIL = 1e-3
 # Share of rejected detections from which another centre of the lens is tried in any case.
 _MUCH = 0.05
+# Maximum number of fits about principal points, which move a little with each.
+_CENTERED = 3
 # Minimum sum of squared residuals, px², against a division by zero.
 _MIN_CHI2 = 1e-20
+# Minimum noise of pixels, px.
+_MIN_PX = 1e-9
 
 
 def share_explained(solution: Solution, frame: ImageFrame) -> float:
@@ -118,6 +130,28 @@ def _fit_terms(solution: Solution, params: Parameters, terms: int, search: Searc
         return None
     unbent, _ = problem.pixels(dataclasses.replace(found.params, lens=None))
     return found if before_fold(found.params.lens[:, None], unbent)[found.used].all() else None
+
+
+def about_principal_points(
+    solution: Solution, expected: Expected, frame: ImageFrame, noise: float | None
+) -> Solution:
+    """Fit with distortion about the principal points, while that agrees better with the images.
+
+    Lenses are symmetric about them, and poses of a flange determine them.
+
+    noise : of joint readings, rad; None to estimate it.
+    """
+    for _ in range(_CENTERED):
+        lens, center = solution.params.lens, intrinsics_of(solution.params.P)[:, :2, 2]
+        inside = (np.abs(center - frame.center) < 0.5 * frame.size[:, None]).all()
+        if lens is None or solution.params.lens_terms > LENS or not inside:
+            break
+        params = dataclasses.replace(solution.params, lens=np.hstack([center, lens[:, 2:]]))
+        found = fit_inliers(solution.problem, params, solution.sigma_px, min_px=expected.min_px or _MIN_PX)
+        if found is None or (found := fit_joint_noise(found, expected, noise)).sigma_px >= solution.sigma_px:
+            break
+        solution = found
+    return solution
 
 
 def undistorted(detections: Detections, lens: FloatArray | None) -> Detections:

@@ -59,7 +59,12 @@ from projservo_cli.calibration.joint_model import (
 )
 from projservo_cli.calibration.known_intrinsics import KnownCameras, with_known_intrinsics
 from projservo_cli.calibration.known_shape import with_known_shapes
-from projservo_cli.calibration.lens_estimation import fit_lens, share_explained, undistorted
+from projservo_cli.calibration.lens_estimation import (
+    about_principal_points,
+    fit_lens,
+    share_explained,
+    undistorted,
+)
 from projservo_cli.calibration.prediction import LENS, along_the_arm
 from projservo_cli.calibration.projective import Projective
 from projservo_cli.calibration.robust_fit import (
@@ -304,6 +309,8 @@ def _maximum_likelihood(
             curved = fit_joint_model(solution, curves, epipolar)
             solution = solution if curved is None else curved.solution
         solution = fit_joint_noise(solution, expected, search.joint_noise)
+        if lens and solution.params.known_arm:
+            solution = about_principal_points(solution, expected, frame, search.joint_noise)
         if curves == [] and (curved := fit_errors_of_place(solution, expected)) is not None:
             solution, of_stated = curved.solution, [*curved.findings]
         if boards:
