@@ -62,8 +62,8 @@ def _contradicted(
     for v in np.flatnonzero(which):
         by_camera = free.errors().shared[v * CAMERA : (v + 1) * CAMERA]
         rows = intrinsics_derivative(free.params.P[v]) @ by_camera
-        shown = expected.noise_px(free) * np.linalg.norm(rows, axis=1)
-        i = int(np.argmax(np.abs(K[v] - stated[v]) / np.hypot(shown, cameras.deviation[v])))
+        by_images = expected.noise_px(free) * np.linalg.norm(rows, axis=1)
+        i = int(np.argmax(np.abs(K[v] - stated[v]) / np.hypot(by_images, cameras.deviation[v])))
         subject = Subject(views=(free.problem.detections.view[int(v)],), name=_ENTRIES[i])
-        about = float(K[v, i]), float(shown[i]), float(stated[v, i])
+        about = float(K[v, i]), float(by_images[i]), float(stated[v, i])
         yield Finding("other_intrinsics", LIMITS, subject, *about, "px")

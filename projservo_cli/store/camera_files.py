@@ -120,8 +120,8 @@ def _distorted(K: FloatArray, coefficients: FloatArray, model: str, x: FloatArra
         r = np.sqrt(square)
         theta = np.arctan(r)
         k = np.pad(coefficients, (0, 4))[:4]
-        bent = theta * (1.0 + sum(k[i] * theta ** (2 * i + 2) for i in range(4)))
-        y = x * np.where(r > 1e-9, bent / np.maximum(r, 1e-9), 1.0)
+        distorted = theta * (1.0 + sum(k[i] * theta ** (2 * i + 2) for i in range(4)))
+        y = x * np.where(r > 1e-9, distorted / np.maximum(r, 1e-9), 1.0)
     else:
         c = np.pad(coefficients, (0, 8))[:8]  # k1, k2, p1, p2, k3, then k4, k5, k6 of a divisor
         shifts, radial = opencv_terms(x) * c[:5], [0, 1, 4]

@@ -154,8 +154,8 @@ def simulated_robot(driven: Drive, joints: Joints, robot: FaultyRobot) -> Plugin
     if driven.endless:
         endless = np.full(len(joints.types), math.inf)
         bounds = bounds._replace(limits=bounds.limits._replace(lower=-endless, upper=endless))
-    markers, late = len(robot.world.truth.number), (_NEVER_LATE_S, _NEVER_LATE_S)
-    return PluginRobot(robot, "the simulated robot", markers, bounds, *late, objects=len(driven.further))
+    markers, waits = len(robot.world.truth.number), (_NEVER_LATE_S, _NEVER_LATE_S)
+    return PluginRobot(robot, "the simulated robot", markers, bounds, *waits, objects=len(driven.further))
 
 
 def opened_robot(
