@@ -22,14 +22,14 @@ class _Unsearched(Frames):
         super().__init__(arm.rendered)
         self._arm, self._kept = arm, {}
 
-    def _drawn(self, view, q):
+    def _drawn(self, view, q, time):
         T, before = self._arm.displacement, self._kept.get(view)
         if before is None or np.abs(before[0] - q).max() > _STILL or (before[1] != T).any():
             if self.rendered.scene.objects:
                 objects = self._model.body("scene with tags")
                 objects.pos, turn = T[:3, 3], Rotation.from_matrix(T[:3, :3])
                 objects.quat = turn.as_quat(scalar_first=True)
-            before = self._kept[view] = q.copy(), T, super()._drawn(view, q)
+            before = self._kept[view] = q.copy(), T, super()._drawn(view, q, time)
         return before[2]
 
     def _found(self, view):
