@@ -7,13 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, reject
 from hypothesis import strategies as st
 
 from projservo_cli.control.law import OK
 from projservo_cli.laws import CODES, LAW_SPECS
 from projservo_cli.loop.python_loop import BuiltInLaw
-from projservo_cli.records import FloatArray, Model
+from projservo_cli.records import FloatArray, Model, WorkFailed
 from projservo_cli.task.target import TargetGoal, TaskImages
 from tests.samples import frame, in_frame
 from tests.scene import FACE_LAWS, GAINS, scene
@@ -107,6 +107,9 @@ def test_a_command_does_not_depend_on_how_the_scene_is_described(law, types, mar
         if change in changes and not (LAW_SPECS[law].metric and change is other_frame):
             described, sense = change(described, rng)
             senses = senses * sense
-    wanted = senses * at.command(law)
+    try:
+        wanted = senses * at.command(law)
+    except WorkFailed:  # the face is seen from both sides, so no law is asked
+        reject()
     # Round-off of a triangulation, times the condition of the joints' motions.
     np.testing.assert_allclose(described.command(law), wanted, atol=1e-7 * np.abs(wanted).max())
