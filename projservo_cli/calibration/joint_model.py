@@ -191,7 +191,7 @@ def fit_errors_of_place(start: Solution, expected: Expected) -> JointModelFit | 
         """Fit with terms of a size, at the noise of poses of a fit near it."""
         spread = size / max(near.sigma_px, 1e-9)
         problem = dataclasses.replace(bare, tau=near.problem.tau, term_spread=spread)
-        return fit_inliers(problem, params, near.sigma_px, min_px=expected.min_px or 1e-9)
+        return fit_inliers(problem, params, near.sigma_px, min_px=expected.min_px)
 
     if (wide := fitted(near, params, _WIDE)) is None:
         return None

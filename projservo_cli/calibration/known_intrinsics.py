@@ -48,7 +48,7 @@ def _agreeing(free: Solution, cameras: KnownCameras, which: BoolArray, expected:
     noise_px = max(expected.sigma_px if expected.known else free.sigma_px, 1e-9)
     spread = np.where(which[:, None], cameras.deviation / noise_px, np.inf)
     problem = dataclasses.replace(free.problem, stated=StatedIntrinsics(cameras.K, spread))
-    found = fit_inliers(problem, free.params, free.sigma_px, min_px=expected.min_px or 1e-9)
+    found = fit_inliers(problem, free.params, free.sigma_px, min_px=expected.min_px)
     if found is None or chance(found, free) < _BY_CHANCE:
         return None
     return dataclasses.replace(found, joint_noise=free.joint_noise)
@@ -59,8 +59,9 @@ def _contradicted(
 ) -> Iterator[Finding]:
     """Yield a finding for each of some views (V,), by the entry farthest off within both deviations."""
     K, stated = intrinsics_of(free.params.P)[:, *UPPER], cameras.K[:, *UPPER]
+    shared = free.errors().shared if which.any() else np.zeros((0, 0))
     for v in np.flatnonzero(which):
-        by_camera = free.errors().shared[v * CAMERA : (v + 1) * CAMERA]
+        by_camera = shared[v * CAMERA : (v + 1) * CAMERA]
         rows = intrinsics_derivative(free.params.P[v]) @ by_camera
         by_images = expected.noise_px(free) * np.linalg.norm(rows, axis=1)
         i = int(np.argmax(np.abs(K[v] - stated[v]) / np.hypot(by_images, cameras.deviation[v])))

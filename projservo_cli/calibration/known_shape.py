@@ -82,7 +82,7 @@ def _fitted(free: Solution, boards: Sequence[StatedBoard], expected: Expected) -
     problem = free.problem.alike(detections).with_noise(free.problem.tau)
     params = _with_shapes(_upgraded(free, boards), detections, boards)
     start = minimize(problem, params, free.used, robust=True, max_steps=50).params
-    found = fit_inliers(problem, start, free.sigma_px, min_px=expected.min_px or 1e-9)
+    found = fit_inliers(problem, start, free.sigma_px, min_px=expected.min_px)
     noise = free.joint_noise
     if found is None or noise is None:
         return found

@@ -33,8 +33,6 @@ _MUCH = 0.05
 _CENTERED = 3
 # Minimum sum of squared residuals, px², against a division by zero.
 _MIN_CHI2 = 1e-20
-# Minimum noise of pixels, px.
-_MIN_PX = 1e-9
 
 
 def share_explained(solution: Solution, frame: ImageFrame) -> float:
@@ -126,10 +124,16 @@ def _fit_terms(solution: Solution, params: Parameters, terms: int, search: Searc
     if params.known_arm:  # poses of a flange err, and an exact fit would reject some of them whole
         problem = problem.with_noise(solution.problem.tau)
     found = fit_from(problem, dataclasses.replace(params, lens_terms=terms), search.epipolar)
-    if found is None or found.params.lens is None:
-        return None
-    unbent, _ = problem.pixels(dataclasses.replace(found.params, lens=None))
-    return found if before_fold(found.params.lens[:, None], unbent)[found.used].all() else None
+    return None if found is None or _folds(found) else found
+
+
+def _folds(solution: Solution) -> bool:
+    """Whether a lens folds within the images used."""
+    lens = solution.params.lens
+    if lens is None:
+        return False
+    unbent, _ = solution.problem.pixels(dataclasses.replace(solution.params, lens=None))
+    return not before_fold(lens[:, None], unbent)[solution.used].all()
 
 
 def about_principal_points(
@@ -147,8 +151,11 @@ def about_principal_points(
         if lens is None or solution.params.lens_terms > LENS or not inside:
             break
         params = dataclasses.replace(solution.params, lens=np.hstack([center, lens[:, 2:]]))
-        found = fit_inliers(solution.problem, params, solution.sigma_px, min_px=expected.min_px or _MIN_PX)
-        if found is None or (found := fit_joint_noise(found, expected, noise)).sigma_px >= solution.sigma_px:
+        found = fit_inliers(solution.problem, params, solution.sigma_px, min_px=expected.min_px)
+        if found is None or _folds(found):
+            break
+        found = fit_joint_noise(found, expected, noise)
+        if found.sigma_px >= solution.sigma_px:
             break
         solution = found
     return solution

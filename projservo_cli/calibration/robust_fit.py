@@ -54,6 +54,8 @@ _MAX_JUDGED_DETECTIONS, _MIN_JUDGED = 40_000, 8
 _SEARCHED = 12
 # Maximum number of rounds in which inliers are selected.
 _MASK_ROUNDS = 4
+# Minimum noise of pixels of exact images, px.
+_EXACT_PX = 1e-9
 # Share of observations that are wrong above which whole tracks are tested.
 _MANY = 0.01
 # Share of detections whose change between rounds is ignored.
@@ -466,7 +468,7 @@ def fit_inliers(
     rig_px: float = 0.0,
     *,
     hopeless: float = np.inf,
-    min_px: float = 1e-9,
+    min_px: float = 0.0,
 ) -> Solution | None:
     """Least squares of the inliers, in rounds until they no longer change.
 
@@ -482,6 +484,7 @@ def fit_inliers(
         residual, seen = problem.residual(params), problem.detections.seen
         dof = _degrees_of_freedom(problem, params, seen)
         return Solution(problem, params, residual, seen, dof) if dof > 0 else None
+    min_px = max(min_px, _EXACT_PX)
     params, within = _within(problem, params, max(sigma, min_px), max(sigma, min_px), rig_px)
     for _ in range(_MASK_ROUNDS):
         used = within

@@ -246,11 +246,8 @@ class BuiltInLaw:
     @property
     def path(self) -> FloatArray:
         """Joints (parts + 1, n) between the parts of the last step; one row if it has none."""
-        return (
-            self.state.step.path[: self.state.step.parts[0] + 1]
-            if self.gains.substeps
-            else self.state.step.path[:1]
-        )
+        step = self.state.step
+        return step.path[: step.parts[0] + 1] if self.gains.substeps else step.path[:1]
 
     def __call__(self, s: FloatArray, q: FloatArray) -> tuple[int, FloatArray]:
         """Status and joint velocity of one instant."""

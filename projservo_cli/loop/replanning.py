@@ -168,12 +168,8 @@ class ExecutionMonitor:
             self._blind, self._excluded = 0, [*self._excluded, path[-1].copy()]
             return self._replanned(log, k, MARKERS_LOST, "goal_hidden")
         clock = min(clock, end)
-        state.plan.clock[0], state.step.parts[0], state.step.share[0], state.step.blocked[0] = (
-            clock,
-            0,
-            -1.0,
-            -1,
-        )
+        state.plan.clock[0], step = clock, state.step
+        step.parts[0], step.share[0], step.blocked[0] = 0, -1.0, -1
         there = np.array([np.interp(clock, np.arange(len(path)), joint) for joint in path.T])
         q_dot[:] = (there - log.read[k]) / self.law.gains.period
         return RUNNING

@@ -41,7 +41,7 @@ _NEAR_M, _FAR_M = 0.01, 50.0  # range of cameras
 _WALL, _WALL_M = "far wall", 40.0  # background, and its distance
 _FINER = 2
 """Pixels of a drawing along each of a frame: of one alone, edges are drawn up to a tenth of a pixel off."""
-_AT_OPENING = np.zeros(1)
+AT_OPENING = np.zeros(1)  # instants of a frame, s, unless they are given
 _STILL = 1e-5  # rad or m: smaller motions in an exposure cause no blur
 
 
@@ -402,7 +402,7 @@ class Frames:
         q: FloatArray,
         moved: tuple[int, FloatArray] | None,
         rng: np.random.Generator,
-        times: FloatArray = _AT_OPENING,
+        times: FloatArray = AT_OPENING,
     ) -> tuple[FloatArray, FloatArray]:
         """Pixels (m, 2) that are found in a frame, NaN where unseen, and their deviations (m,), px.
 

@@ -23,7 +23,7 @@ from projservo_cli.simulation.arm import SerialArm
 from projservo_cli.simulation.ground_truth import SceneObject, Truth
 from projservo_cli.simulation.mujoco_servos import Physics
 from projservo_cli.simulation.random_streams import generator
-from projservo_cli.simulation.rendering import Frames, RenderedScene, rendered_model
+from projservo_cli.simulation.rendering import AT_OPENING, Frames, RenderedScene, rendered_model
 
 # Joints are worked out this often at least, s, and taken as straight lines between.
 _GRID_S = 0.005
@@ -31,7 +31,6 @@ _EXPOSED = 5  # instants of an exposure that are averaged
 _POSTURES = 500  # that are drawn to see how far an arm reaches
 _BEFORE = 2**20  # frames before the opening are numbered too
 _CLOCKS_S = 100.0  # maximum offset of clocks of cameras
-_AT_OPENING = np.zeros(1)
 
 
 class SimulatedRobot(NamedTuple):
@@ -95,7 +94,7 @@ class Points(NamedTuple):
         q: FloatArray,
         moved: tuple[int, FloatArray] | None,
         rng: np.random.Generator,
-        times: FloatArray = _AT_OPENING,
+        times: FloatArray = AT_OPENING,
     ) -> tuple[FloatArray, FloatArray | None]:
         """As of all cameras."""
         M = self.truth.M

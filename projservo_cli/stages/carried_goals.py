@@ -95,14 +95,13 @@ def _carried(scenario: Scenario, carrier: CarryingObject, session: Session | Non
 @lru_cache(maxsize=8)  # the same for all laws of a plan
 def markers_now(c: Calibration, carried: CarriedByObject) -> UncertainPoints:
     """Return the markers of an object of a plan where it is now."""
-    return object_of(c, carried).markers(carried.object_marker.tolist())
-
-
-def object_of(c: Calibration, carried: CarriedByObject, metric: Metric | None = None) -> DisplacedObject:
-    """Return an object of a plan, as it was found for it."""
     numbers = carried.object_marker.tolist()
-    observed = [ObjectView(carried.s_object_taught), ObjectView(carried.s_object, carried.sigma_object)]
-    return DisplacedObject.of(c, numbers, observed, metric)
+    return DisplacedObject.of(c, numbers, observations_of(carried)).markers(numbers)
+
+
+def observations_of(carried: CarriedByObject) -> tuple[ObjectView, ObjectView]:
+    """Return an object of a plan as it was seen when its goal was taught, and when it was planned."""
+    return ObjectView(carried.s_object_taught), ObjectView(carried.s_object, carried.sigma_object)
 
 
 def _in_body(found: DisplacedObject, H: FloatArray, numbers: Sequence[int]) -> FloatArray:

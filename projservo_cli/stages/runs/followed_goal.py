@@ -11,11 +11,10 @@ from projservo_cli.loop.goal_monitor import FollowLimits, GoalMonitor
 from projservo_cli.records import MM, FloatArray, GoalHistory, InputError, Plan
 from projservo_cli.robots.latency_compensation import Tracked
 from projservo_cli.robots.session import Session
-from projservo_cli.stages.carried_goals import in_metres, object_of
+from projservo_cli.stages.carried_goals import in_metres, observations_of
 from projservo_cli.stages.scenario import RunScenario
 from projservo_cli.stages.worlds.calibrated import CalibratedWorld
 from projservo_cli.task.objects.moving_goal import MovingGoal
-from projservo_cli.task.objects.object_bundle_adjustment import ObjectView
 from projservo_cli.task.objects.object_tracker import ObjectTracker
 from projservo_cli.task.target import TaskImages
 
@@ -60,19 +59,18 @@ def followed_goal(
             f"objects.{carrier.name}.follow: the latency of the cameras is not known, and the object moves "
             "meanwhile: calibrate from images of a moving arm (projservo record), or set plant.time_offset_s"
         )
-    observed = ObjectView(carried.s_object_taught), ObjectView(carried.s_object, carried.sigma_object)
     metric = in_metres(c, carrier.lengths)[0]
     tracker = ObjectTracker.of(
         c,
         numbers,
-        observed,
+        observations_of(carried),
         metric=metric,
         acceleration=asked.acceleration,
         max_acceleration=asked.max_acceleration,
         name=carrier.name,
     )
     whole = not scenario.exact.goal.incidences
-    goal = MovingGoal(images(), scenario.world.model, object_of(c, carried, metric), tracker, whole)
+    goal = MovingGoal(images(), scenario.world.model, tracker, whole)
     max_speed = math.inf if asked.max_speed_mm_s is None else asked.max_speed_mm_s
     limits = FollowLimits(scenario.servo.stop.follow_s, max_speed, asked.lost_s, asked.approach_mm)
     indices = [contract.driven.further.index(number) for number in numbers]

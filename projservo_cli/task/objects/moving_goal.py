@@ -8,7 +8,6 @@ from scipy.spatial.transform import Rotation
 
 from projservo_cli.geometry.kinematics import project
 from projservo_cli.records import FloatArray, Model
-from projservo_cli.task.objects.displaced_object import DisplacedObject
 from projservo_cli.task.objects.object_tracker import ObjectMotion, ObjectTracker
 from projservo_cli.task.target import Place, TaskImages
 
@@ -21,13 +20,12 @@ class MovingGoal:
 
     images: TaskImages  # start and goal as a law measures them, with a body, the goal where the plan has it
     model: Model  # calibrated
-    planned: DisplacedObject  # the object when the motion was planned
     tracker: ObjectTracker
     whole: bool  # whether it is the whole pose, instead of incidences
 
     def moved(self, motion: ObjectMotion) -> FloatArray:
         """Displacement (4, 4) of the goal since the motion was planned."""
-        return np.asarray(motion.D @ np.linalg.inv(self.planned.D))
+        return np.asarray(motion.D @ np.linalg.inv(self.tracker.planned.D))
 
     @cached_property
     def H(self) -> FloatArray:
@@ -70,8 +68,9 @@ class MovingGoal:
 
         NaN without a known length, or if the joints leave angles open.
         """
-        rig, M = self.planned.rig, self.images.body.M
+        planned, M = self.tracker.planned, self.images.body.M
+        rig = planned.rig
         apart = (M @ (rig.G @ (H - H_star)).T)[:, :3]
         turn = (rig.G @ H @ np.linalg.inv(rig.G @ H_star))[:3, :3]
         angle = Rotation.from_matrix(turn).magnitude() if rig.rigid else np.nan
-        return float(self.planned.unit_mm * np.sqrt((apart**2).sum(axis=1).mean())), float(np.degrees(angle))
+        return float(planned.unit_mm * np.sqrt((apart**2).sum(axis=1).mean())), float(np.degrees(angle))

@@ -151,7 +151,8 @@ class ObjectTracker:
     """Tracker of an object whose shape and first place frames have shown.
 
     ``covered``: views that the last images left out, since they show no motion of the object, or another
-    than the rest; ``pushed``: that it accelerated beyond its limit as all views agree.
+    than the rest; ``pushed``: that it accelerated beyond its limit as all views agree; ``planned``: the
+    object as its first frames showed it.
     """
 
     def __init__(
@@ -165,7 +166,7 @@ class ObjectTracker:
     ) -> None:
         points, rig = found.markers(found.marker, 0), found.rig
         self.M = found.M  # (k, 4) its markers when taught, in the calibrated frame
-        self._found, self._indices = found, list(indices)  # of its markers among those of the images
+        self.planned, self._indices = found, list(indices)  # of its markers among those of the images
         self._rig, self._view, self._unit_mm = rig, tuple(view), found.unit_mm
         self._of = Subject(markers=found.marker, name=name)
         self._X, self._X_by = points.X, (points.by_images, points.by_calibration)
@@ -276,7 +277,7 @@ class ObjectTracker:
         by_shape, by_calibration, alike = np.split(self._shared_errors(t)[:g], [N, N + c], axis=1)
         values, vectors = np.linalg.eigh(state.P[:g, :g])
         by_images = np.hstack([vectors * np.sqrt(np.maximum(values, 0.0)), by_shape, alike])
-        return self._found.carry(goal, Displaced(state.T, np.eye(4), self._E, by_images, by_calibration))
+        return self.planned.carry(goal, Displaced(state.T, np.eye(4), self._E, by_images, by_calibration))
 
     def unseen_s(self, t: float) -> float:
         """Time since enough markers were seen last, s."""
