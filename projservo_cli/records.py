@@ -1055,7 +1055,10 @@ class CarriedByObject(RecordPart):
         "view object_marker xy", "px", "images of these when the goal was taught, NaN if unseen"
     )
     sigma_object: FloatArray | None = _optional_array(
-        "view object_marker", "px", "standard deviation of a coordinate of these, NaN if unknown"
+        "view object_marker", "px", "standard deviation of a coordinate when it was planned, NaN if unknown"
+    )
+    sigma_object_taught: FloatArray | None = _optional_array(
+        "view object_marker", "px", "standard deviation of a coordinate when taught, NaN if unknown"
     )
     s_carried: FloatArray = _array(
         "view observed xy", "px", "images of all markers of the body at the carried goal"
@@ -1326,6 +1329,15 @@ class GoalHistory(RecordPart):
     )
     followed_seconds: float = _scalar("s", "time since the first arrival; 0 without one")
     followed_speed_mm_s: float | None = _optional_scalar("mm/s", "mean speed of the object; likewise")
+    followed_deviation_mm: float | None = _optional_scalar(
+        "mm", "stated deviation of the goal at the end; likewise, and none for a retreat"
+    )
+    followed_deviation_deg: float | None = _optional_scalar(
+        "deg", "likewise; none if the joints leave angles open"
+    )
+    followed_motion: str = _scalar(
+        about="motion of the object in the last frames: still, belt, turntable or free"
+    )
     goal_time: FloatArray = _array("time", "s", "clock of the robot")
     goal_error_px: FloatArray = _array(
         "time", "px", "image error to the goal where it was; NaN if unmeasured"

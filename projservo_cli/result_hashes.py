@@ -63,8 +63,8 @@ _ADDED: dict[str, dict[str, Any]] = {
     **{name: {"staggered": False} for name in ("KnownBoard", "StatedBoard")},
     "ObjectSettings": {
         "follow": False,
-        "acceleration": 100.0,
-        "max_acceleration": 2000.0,
+        "acceleration": 20.0,
+        "max_acceleration": 1000.0,
         "max_speed_mm_s": None,
         "lost_s": 0.5,
         "approach_mm": 0.0,

@@ -397,6 +397,8 @@ def _of_laws(value: dict[str, Any], _: bool) -> Iterator[str]:
             rest = ", ".join(map(_incidence, trace["incidences"]))
             name, free = named(trace), trace["free_dof"]
             yield wrapped(f"{name}: {rest}; {'no' if free == 0 else free} joint motion free", "  ")
+        if "following" in trace:
+            yield wrapped(f"{named(trace)}: {_following(trace['following'])}", "  ")
     if acts := [step for step in value.get("steps", ()) if step["kind"] != "move"]:
         yield wrapped(", ".join(f"{step['name']}: {step['reason']}" for step in acts), "  ")
     for name, said in _NOTES.items():
@@ -410,6 +412,23 @@ def _incidence(row: dict[str, Any]) -> str:
     said = [f"{number:.2g} {unit}" for number, unit in parts if number is not None and number == number]
     within = f"within {', '.join(said)}, " if said else ""
     return f"{row['name']} {within}{row['error_px']:.2g} px as seen"
+
+
+# Motions of an object that a goal is followed on.
+_MOVES = {
+    "still": "stood still",
+    "belt": "moved along a line",
+    "turntable": "turned about an axis",
+    "free": "moved freely",
+}
+
+
+def _following(found: dict[str, Any]) -> str:
+    """How an object moved, how near the tool stayed to its goal, and how well that is known."""
+    parts = [(" at", "speed_mm_s", "mm/s"), ("; the tool stayed within", "rms_mm", "mm rms of its goal")]
+    parts += [(", and", "rms_deg", "deg"), ("; the goal is known to", "deviation_mm", "mm")]
+    said = [f"{to} {found[key]:.2g} {unit}" for to, key, unit in parts if found[key] is not None]
+    return f"the object {_MOVES[found['motion']]}{''.join(said)}"
 
 
 def _of_report(value: dict[str, Any], detailed: bool) -> Iterator[str]:

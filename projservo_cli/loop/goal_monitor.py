@@ -44,6 +44,8 @@ _LEARNT_S = 0.4
 _KEPT = 0.9
 # Consecutive periods in which a limit of an estimate is passed that count as passed.
 _SURE = 5
+# Time of a retreat from a goal that is lost, at most, s, and share of its way that is left out.
+_BACK_S, _LEFT_OUT = 3.0, 0.1
 
 
 class FollowLimits(NamedTuple):
@@ -65,12 +67,14 @@ class Followed(NamedTuple):
     sigma_px: float  # stated deviation of the error
     speed: float  # of the object, mm/s or px/s
     unseen_s: float  # since its object was seen
+    H: FloatArray = np.full((4, 4), np.nan)  # of the tool as measured
 
 
 class GoalMonitor:
     """The goal of a run that moves: it leads the law, and rules by how well the goal is followed.
 
     ``periods``: the goal over time. ``since``: period from which on it is followed; None before.
+    ``here``: start and goal in the last period.
     """
 
     def __init__(
@@ -86,7 +90,11 @@ class GoalMonitor:
         self._rest: FloatArray = np.zeros(0)
         self._behind: FloatArray = np.zeros(2)
         self._turned: Finding | None = None  # why the law cannot be given the goal
+        self._given_up: int | None = None  # period in which it was
         self._ends: tuple[int, FloatArray, int] | None = None  # verdict, last velocity, periods since
+        # Displacement (4, 4) of the goal to which the arm retreats, and when that began; None if it does not.
+        self._back: tuple[FloatArray, float] | None = None
+        self._retreats = True  # whether it may
 
     def lead(self) -> FloatArray:
         """Give the law the goal where it will be, and return the images (V, m, 2) of the face where it is."""
@@ -95,16 +103,18 @@ class GoalMonitor:
         # The law measures the arm where it will come to rest, its servos' lag later.
         arrives = t + self._servo_lag_s(t)
         self._now = goal.tracker.at(arrives)
-        self._D = goal.moved(self._now)
         ahead = goal.tracker.at(arrives + self.lead_s)
-        images = goal.at(goal.moved(ahead if self._leads else self._now))
+        self._D, D_ahead = goal.moved(self._now), goal.moved(ahead if self._leads else self._now)
+        if self._back is not None:
+            self._D = D_ahead = self._back[0]
+        images = goal.at(D_ahead)
         self._ahead, self._turned = images.by_points().s_star, None
         try:
             self._law.lead_to(images.task(self._law.law.model))
         except WorkFailed as error:
             self._turned = from_text(str(error), REFUSES)
-        self._here = goal.at(self._D)
-        self.s_star, now = self._here.by_points().s_star, self._now
+        self.here = goal.at(self._D)
+        self.s_star, now = self.here.by_points().s_star, self._now
         self.periods.append(
             Followed(
                 t=t,
@@ -134,7 +144,7 @@ class GoalMonitor:
         state = self._law.state
         if math.isfinite(float(state.face_px[0])):  # it measured
             error = self._error(state, self._D @ self._goal.H)
-            self.periods[-1] = self.periods[-1]._replace(error=error)
+            self.periods[-1] = self.periods[-1]._replace(error=error, H=state.pose.copy())
         return self.periods[-1].error[0]
 
     def _error(self, state: State, H_star: FloatArray) -> tuple[float, float, float]:
@@ -144,7 +154,7 @@ class GoalMonitor:
         """
         goal, model = self._goal, self._law.law.model
         if not goal.whole:
-            rows = self._here.task(model).incidences
+            rows = self.here.task(model).incidences
             return image_error_at(rows, state.pose), math.nan, math.nan
         A_star = goal.images.body.M[: len(state.A)] @ H_star.T
         off = project(model.P, state.A) - project(model.P, A_star)
@@ -152,8 +162,8 @@ class GoalMonitor:
 
     @property
     def followed(self) -> list[Followed]:
-        """Periods since the goal was reached last; none before."""
-        return [] if self.since is None else self.periods[self.since :]
+        """Periods since the goal was reached last, until it was given up; none before."""
+        return [] if self.since is None else self.periods[self.since : self._given_up]
 
     def goes_on(self, limits: Limits) -> None:
         """Lead the law on by other limits, to no other verdict than that the goal is lost."""
@@ -167,8 +177,10 @@ class GoalMonitor:
 
     def ruled(self, log: Log, k: int, verdict: int, q_dot: FloatArray) -> int:
         """Return the new verdict; the arm slows down before it ends a run without its goal."""
+        if self._ends is not None and k == self._limits.max_steps:
+            return self._ends[0]
         if self._ends is not None:
-            return self._slowed(q_dot)
+            return RUNNING if self._goes_back(log, k, verdict) else self._slowed(q_dot)
         if verdict in (JOINT_LIMIT, OUT_OF_VIEW):
             return OUT_OF_REACH
         if verdict == NO_PROGRESS or k == self._limits.max_steps:
@@ -180,7 +192,7 @@ class GoalMonitor:
         cause = self._cause(log, k, q_dot)
         if cause != RUNNING:
             before = log.q_dot[k - 1] if k else np.zeros_like(q_dot)
-            self._ends = cause, before.copy(), 0
+            self._ends, self._given_up = (cause, before.copy(), 0), len(self.periods)
             return self._slowed(q_dot)
         if verdict == WAITING:
             return verdict
@@ -252,4 +264,31 @@ class GoalMonitor:
         needed = max(1, math.ceil(float(periods_each.max())))
         self._ends = verdict, before, periods + 1
         q_dot[:] = before * (1.0 - (periods + 1) / needed)
-        return verdict if periods + 1 >= needed else RUNNING
+        if periods + 1 < needed or self._begins_back(verdict):
+            return RUNNING
+        return verdict
+
+    def _begins_back(self, verdict: int) -> bool:
+        """Whether the arm, at rest near a goal that is lost, begins to retreat: as it came to its object."""
+        H_star, near = self._goal.H, self._asked.approach_mm
+        measured = [one for one in self.periods if np.isfinite(one.H).all()]
+        if verdict != LOST_GOAL or not self._retreats or not measured[-1].error[1] < near:
+            return False
+        far = next((one for one in reversed(measured) if not one.error[1] < near), measured[0])
+        relative = np.linalg.solve(far.D @ H_star, far.H)
+        D = measured[-1].D @ H_star @ relative @ np.linalg.inv(H_star)
+        self._back, self._retreats = (D, self.periods[-1].t), False
+        return True
+
+    def _goes_back(self, log: Log, k: int, verdict: int) -> bool:
+        """Whether the arm retreats; it slows down once it is there, or can go no farther."""
+        if self._back is None:
+            return False
+        now, began = self.periods[-1], self._back[1]
+        way = next(one.error[0] for one in self.periods if one.t > began)
+        left = max(_LEFT_OUT * way, tolerance(self._limits, float(log.fit[k, 2]), self._robot.noise_ratio))
+        if verdict in (RUNNING, CONVERGED, WAITING) and now.t < began + _BACK_S and not now.error[0] < left:
+            return True
+        assert self._ends is not None
+        self._back, self._ends = None, (self._ends[0], log.q_dot[k - 1].copy(), 0)
+        return False

@@ -95,7 +95,10 @@ def _laws(run: Run, laws: Sequence[str]) -> dict[str, Any]:
 
 
 # Numbers of a goal that was followed.
-_FOLLOWED = ("rms_px", "rms_mm", "max_mm", "rms_deg", "seconds", "speed_mm_s")
+_FOLLOWED = (
+    *("rms_px", "rms_mm", "max_mm", "rms_deg", "seconds", "speed_mm_s"),
+    *("deviation_mm", "deviation_deg", "motion"),
+)
 
 
 def _law(trace: Trace) -> dict[str, Any]:

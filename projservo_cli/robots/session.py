@@ -3,7 +3,7 @@
 from collections.abc import Callable, Collection
 from contextlib import ExitStack
 from types import TracebackType
-from typing import Self
+from typing import Any, NamedTuple, Self
 
 from projservo_cli.findings import NOTE, REFUSES, Finding, Subject
 from projservo_cli.messages import failed
@@ -13,14 +13,21 @@ from projservo_cli.robots.object_watch import LOOKS, ObjectWatch
 from projservo_cli.robots.pacing import Steered
 
 
+class FollowedObject(NamedTuple):
+    """The object at whose goal the arm is while it moves."""
+
+    name: str
+    go_on: Callable[[float], None]  # lets the arm go on following it for a time, s
+    goal: Any  # as the last run followed it, so that a retreat starts from it
+
+
 class Session:
     """A connection that is always stopped and closed at the end of its block; effects of actions stay.
 
     ``robot``: that was opened, None before. ``steered``: its set-points. ``acted``: values that actions of it
     were sent last, by their names. ``at``: the watch over the object at whose goal the arm is, None
     elsewhere. ``held``: names of objects that the tool took with an action, by the name of the action.
-    ``followed``: the object at whose goal the arm is while it moves, and what lets the arm go on following it
-    for a time, s; None without one.
+    ``followed``: the object at whose goal the arm is while it moves; None without one.
     """
 
     def __init__(self) -> None:
@@ -29,7 +36,7 @@ class Session:
         self.acted: dict[str, float] = {}
         self.at: ObjectWatch | None = None
         self.held: dict[str, str] = {}
-        self.followed: tuple[str, Callable[[float], None]] | None = None
+        self.followed: FollowedObject | None = None
         self._stack = ExitStack()
 
     def __enter__(self) -> Self:
@@ -61,7 +68,7 @@ class Session:
         """
         takes = None
         if name not in self.held and self.followed is not None:
-            takes = self.followed[0]
+            takes = self.followed.name
         elif name not in self.held and self.at is not None and self.steered is not None:
             _require_there(self.at, self.steered)
             takes = self.at.name
@@ -93,7 +100,7 @@ class Session:
         if self.robot is None or self.steered is None:
             return
         if self.followed is not None:
-            self.followed[1](seconds)
+            self.followed.go_on(seconds)
             return
         end = self.robot.now() + seconds
         self.steered.observe()

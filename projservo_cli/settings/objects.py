@@ -96,12 +96,12 @@ class ObjectSettings(OneOf):
         "a belt, a turntable",
     )
     acceleration: Positive = Field(
-        100.0,
+        20.0,
         description="expected changes of its velocity, standard deviation after 1 s: mm/s² if a length on "
         "the tool is known, otherwise px/s²",
     )
     max_acceleration: Positive = Field(
-        2000.0, description="acceleration, likewise, beyond which it was pushed or taken, so that a run ends"
+        1000.0, description="acceleration, likewise, beyond which it was pushed or taken, so that a run ends"
     )
     max_speed_mm_s: Positive | None = Field(
         None,

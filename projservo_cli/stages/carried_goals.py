@@ -63,22 +63,23 @@ def _carried(scenario: Scenario, carrier: CarryingObject, session: Session | Non
     taught, now = scenario.world.observe_object(carrier, session, scenario.exact, scenario.q_taught)
     try:
         found = DisplacedObject.of(c, carrier.numbers, [taught, now], metric)
-        goal = found.carry(_goal(scenario, c))
+        goal = found.carry(taught_goal(scenario))
     except WorkFailed as error:
         raise messages.failed(error.findings, stage=f"objects.{carrier.name}") from error
     rigid, limits = found.coordinates == 6, carrier.objects
     carried = CarriedByObject(
         object_name=carrier.name,
-        object_shift_mm=_known(found.shift_mm),
-        object_angle_deg=_known(found.angle_deg),
+        object_shift_mm=known(found.shift_mm),
+        object_angle_deg=known(found.angle_deg),
         object_shift_px=found.shift_px,
-        goal_deviation_mm=_known(goal.position_mm),
+        goal_deviation_mm=known(goal.position_mm),
         goal_deviation_deg=goal.rotation_deg if rigid else None,
         goal_deviation_px=goal.rms_px,
         object_marker=np.array(carrier.numbers, dtype=np.int64),
         object_left_out=", ".join(map(str, found.left_out)) or None,
         s_object=now.s,
         s_object_taught=taught.s,
+        sigma_object_taught=taught.sigma,
         sigma_object=now.sigma,
         s_carried=np.ascontiguousarray(goal.s[:, c.indices_of(scenario.world.numbers)]),
         M_object=_in_body(found, goal.H, carrier.numbers),
@@ -101,7 +102,8 @@ def markers_now(c: Calibration, carried: CarriedByObject) -> UncertainPoints:
 
 def observations_of(carried: CarriedByObject) -> tuple[ObjectView, ObjectView]:
     """Return an object of a plan as it was seen when its goal was taught, and when it was planned."""
-    return ObjectView(carried.s_object_taught), ObjectView(carried.s_object, carried.sigma_object)
+    taught = ObjectView(carried.s_object_taught, carried.sigma_object_taught)
+    return taught, ObjectView(carried.s_object, carried.sigma_object)
 
 
 def _in_body(found: DisplacedObject, H: FloatArray, numbers: Sequence[int]) -> FloatArray:
@@ -127,13 +129,14 @@ def too_far(carried: CarriedByObject, carrier: CarryingObject) -> Finding | None
     return None
 
 
-def _known(number: float) -> float | None:
+def known(number: float) -> float | None:
     """A number; None for NaN."""
     return None if math.isnan(number) else number
 
 
-def _goal(scenario: Scenario, c: Calibration) -> ObjectView:
+def taught_goal(scenario: Scenario) -> ObjectView:
     """Images of the markers of the calibration at the goal as it was taught, and their deviations."""
+    c = scenario.world.calibration
     if (given := scenario.goal_pixels) is not None:
         return ObjectView(*given)
     s = np.full((len(c.view), len(c.marker), 2), np.nan)

@@ -1,6 +1,7 @@
 """Goals on objects that move: led, judged where they are, given up in words, and handed over to the tool."""
 
 import json
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from projservo_cli.config.inputs import objects_of, servo_inputs
 from projservo_cli.records import InputError
 from projservo_cli.robots.session import Session
+from projservo_cli.stages import plan as planning
 from projservo_cli.stages.runs.run_trace import trace_of
 from projservo_cli.stages.scenario import run_scenario
 from projservo_cli.stages.servo import drive
@@ -124,7 +126,15 @@ def test_a_goal_that_is_hidden_is_predicted_and_then_lost(monkeypatch):
     monkeypatch.setattr(ObjectTracker, "observe", covered)
     near = driven(moving(BELT, approach_mm=30.0))
     assert near.verdict == "lost goal"
-    assert near.goal.periods[-1].unseen_s < 0.4
+    lost = next(one for one in near.goal.periods if one.unseen_s > 0.2)
+    assert lost.error[1] < 30.0
+    # Back as it came to its part, but for a tenth, from where the arm came to rest.
+    trace, came = trace_of(near), [one.error[1] < 30.0 for one in near.goal.periods].index(True)
+    relative = trace.center - trace.of_goal.goal_center
+    at_rest = np.flatnonzero(np.abs(near.log.q_dot[:-1]).max(axis=1) == 0.0)[0]
+    there = trace.center[at_rest] + relative[came - 1] - relative[at_rest]
+    assert 1e3 * np.linalg.norm(trace.center[near.steps] - there) < 5.0
+    assert near.steps < at_rest + 40
 
 
 def test_an_arm_goes_on_while_it_acts_and_then_holds_the_part():
@@ -141,6 +151,32 @@ def test_an_arm_goes_on_while_it_acts_and_then_holds_the_part():
         count = len(run.goal.periods)
         session.hold(0.2)
         assert len(run.goal.periods) == count  # it belongs to the tool
+
+
+def test_an_arm_leaves_a_part_while_that_moves_on():
+    """60 mm along the normal of the face, and along with the part."""
+    joints = {"joints": [3.6575, -1.6783, -1.8493, 0.2776, 1.1568, 3.5344], "unit": "rad"}
+    steps = [{"to": "there"}, {"retreat": {"along": "front", "by_m": 0.06}}]
+    start = {"joints": [3.3575, -1.4783, -2.0493, 0.5776, 0.9568, 3.9344], "unit": "rad"}
+    task = {"start": start, "goals": {"there": {"joints": joints, "on": "part"}}, "steps": steps}
+    front = "features.front={on: tool, plane: [0, 1, 2]}"
+    config, calibration = moving(BELT, front, f"task={json.dumps(task)}"), calibrated()
+    with Session() as session:
+        at_part = driven(config.at_step("there"), session=session)
+        inputs = servo_inputs(config.at_step("retreat"))
+        inputs = replace(inputs, plan=replace(inputs.plan, q_current=session.robot.read().q))
+        planned = planning.run(inputs.plan, calibration)
+        run = drive(run_scenario(inputs, calibration), planned, "exact", session=session)
+        assert (at_part.verdict, run.verdict) == ("followed", "followed")
+        assert session.followed.name == "part"
+    trace, before = trace_of(run), trace_of(at_part)
+    apart = trace.center[run.steps] - before.center[at_part.steps]
+    along = 0.05 * (trace.of_goal.goal_time[run.steps] - before.of_goal.goal_time[at_part.steps])
+    assert 1e3 * np.linalg.norm(apart - [0.0, along, 0.0]) == pytest.approx(60.0, abs=1.5)
+    assert distances_mm(run)[run.steps] < 1.0
+    assert trace.followed_motion == "belt"
+    assert trace.followed_deviation_mm is None
+    assert before.followed_deviation_mm > trace.followed_rms_mm
 
 
 def test_a_pushed_part_ends_the_run():

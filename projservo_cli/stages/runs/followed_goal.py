@@ -2,7 +2,8 @@
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from dataclasses import replace
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -11,9 +12,8 @@ from projservo_cli.loop.goal_monitor import FollowLimits, GoalMonitor
 from projservo_cli.records import MM, FloatArray, GoalHistory, InputError, Plan
 from projservo_cli.robots.latency_compensation import Tracked
 from projservo_cli.robots.session import Session
-from projservo_cli.stages.carried_goals import in_metres, observations_of
+from projservo_cli.stages.carried_goals import in_metres, known, observations_of, taught_goal
 from projservo_cli.stages.scenario import RunScenario
-from projservo_cli.stages.worlds.calibrated import CalibratedWorld
 from projservo_cli.task.objects.moving_goal import MovingGoal
 from projservo_cli.task.objects.object_tracker import ObjectTracker
 from projservo_cli.task.target import TaskImages
@@ -27,6 +27,25 @@ class FollowedGoal(NamedTuple):
     goal: MovingGoal
     limits: FollowLimits
     tracked: Tracked
+    # True displacements (k, 4, 4) of the object at times (k,), s, since it was planned first, and its middle.
+    truth: Callable[[FloatArray], tuple[FloatArray, FloatArray]]
+    since: float | None = None  # when a retreat from the object began, s
+
+    def true_motion(self, t: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """True displacements (k, 4, 4) of the goal at times (k,), s, and the middle (4,) of its object, m.
+
+        Since the motion was planned; NaN if unknown.
+        """
+        T, middle = self.truth(t)
+        if self.since is None:
+            return T, middle
+        (T_then,), _ = self.truth(np.array([self.since]))
+        return T @ np.linalg.inv(T_then), T_then @ middle
+
+    def retreat(self, images: TaskImages, t: float) -> Self:
+        """Return the goal of a retreat that begins at a time, s, which goes along with the object."""
+        goal = replace(self.goal, images=images, whole=True, D_planned=self.goal.tracker.at(t).D, taught=None)
+        return self._replace(goal=goal, since=t)
 
 
 def followed_goal(
@@ -34,13 +53,17 @@ def followed_goal(
 ) -> FollowedGoal | None:
     """Return the goal of a law that its object carries while it runs; None for a goal that stays.
 
-    It stays once the tool has taken the object in the session.
+    It stays once the tool has taken the object in the session. A retreat from an object that is followed goes
+    along with it.
 
     images : start and goal as the law measures them.
 
     Raises InputError for a law that does not measure with the calibrated body.
     """
-    inputs = scenario.world.inputs
+    inputs, displaced = scenario.world.inputs, scenario.world.inputs.displaced
+    if session.followed is not None and session.robot is not None and displaced and displaced.of_start:
+        left: FollowedGoal = session.followed.goal
+        return left.retreat(images(), session.robot.now())
     if plan is None or not plan.carried or not inputs.carriers[0].settings.follow:
         return None
     if inputs.carriers[0].name in session.held.values():
@@ -70,14 +93,16 @@ def followed_goal(
         name=carrier.name,
     )
     whole = not scenario.exact.goal.incidences
-    goal = MovingGoal(images(), scenario.world.model, tracker, whole)
+    D, taught = tracker.planned.D, taught_goal(scenario)
+    goal = MovingGoal(images(), scenario.world.model, tracker, whole, D, taught)
     max_speed = math.inf if asked.max_speed_mm_s is None else asked.max_speed_mm_s
     limits = FollowLimits(scenario.servo.stop.follow_s, max_speed, asked.lost_s, asked.approach_mm)
     indices = [contract.driven.further.index(number) for number in numbers]
-    return FollowedGoal(goal, limits, Tracked(carried.object_name, indices, tracker))
+    tracked = Tracked(carried.object_name, indices, tracker)
+    return FollowedGoal(goal, limits, tracked, scenario.world.true_motion)
 
 
-def history_of(monitor: GoalMonitor, world: CalibratedWorld, goal: FloatArray, times: int) -> GoalHistory:
+def history_of(monitor: GoalMonitor, followed: FollowedGoal, goal: FloatArray, times: int) -> GoalHistory:
     """Return the history of a goal at some times of a run.
 
     goal : (4,) its true centre when the motion was planned, m.
@@ -91,8 +116,9 @@ def history_of(monitor: GoalMonitor, world: CalibratedWorld, goal: FloatArray, t
     if since:
         rms, maximum = np.sqrt(np.nanmean(left**2, axis=0)), float(np.max(left[np.isfinite(left[:, 0]), 1]))
         speed = float(np.mean([one.speed for one in since])) if math.isfinite(maximum) else math.nan
-    px, mm, deg, max_mm, mm_s = (None if math.isnan(x) else float(x) for x in (*rms, maximum, speed))
-    T, middle = world.true_motion(t)
+    px, mm, deg, max_mm, mm_s = map(known, (*rms, maximum, speed))
+    T, middle = followed.true_motion(t)
+    carried, tracker = followed.goal.carried(t[-1]), followed.goal.tracker
     seconds = np.maximum(np.diff(t, prepend=t[0]), 1e-9)
     steps = np.linalg.norm(np.diff((T @ middle)[:, :3], axis=0, prepend=np.nan), axis=1)
     return GoalHistory(
@@ -102,6 +128,9 @@ def history_of(monitor: GoalMonitor, world: CalibratedWorld, goal: FloatArray, t
         followed_rms_deg=deg,
         followed_seconds=since[-1].t - since[0].t if since else 0.0,
         followed_speed_mm_s=mm_s,
+        followed_deviation_mm=known(math.nan if carried is None else carried.position_mm),
+        followed_deviation_deg=known(math.nan if carried is None else carried.rotation_deg),
+        followed_motion=tracker.kind.name,
         goal_time=t,
         goal_error_px=errors[:, 0],
         goal_error_mm=errors[:, 1],

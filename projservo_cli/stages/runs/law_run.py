@@ -42,10 +42,10 @@ from projservo_cli.records import (
 )
 from projservo_cli.results import ImageModel
 from projservo_cli.robots.latency_compensation import DrivenRobot
-from projservo_cli.robots.session import Session
+from projservo_cli.robots.session import FollowedObject, Session
 from projservo_cli.simulation.analytic_plant import AnalyticPlant, Ends, Plant
 from projservo_cli.stages.plan_motion import PathReplanner, search_of, why_closed
-from projservo_cli.stages.runs.followed_goal import followed_goal
+from projservo_cli.stages.runs.followed_goal import FollowedGoal, followed_goal
 from projservo_cli.stages.runs.plugin_law import LawSetup, PluginLaw
 from projservo_cli.stages.runs.robot_with_monitors import connected_robot
 from projservo_cli.stages.scenario import RunScenario
@@ -93,7 +93,8 @@ class LawRun:
     limited: float = 0.0  # how often visibility limited the translation
     plant: Plant = _NOT_DRIVEN  # that was driven; of an external robot the calibrated model
     replannings: tuple[Finding, ...] = ()
-    goal: GoalMonitor | None = None  # of a goal that moves
+    followed: FollowedGoal | None = None  # of a goal that moves
+    goal: GoalMonitor | None = None  # likewise
     driven: DrivenRobot | None = None  # client of a robot of the contract
     unseen: Finding | None = None  # cameras that showed nothing before the run, though they were compared
     noise_ratio: float = 1.0  # stated noise of pixels at the end over the noise of the run; at least 1
@@ -165,7 +166,7 @@ class LawRun:
         shared, plan = self.brought.session, self.plan if isinstance(self.plan, Plan) else None
         # The matrices of a frame are small: a second thread costs more than it gives.
         with threadpool_limits(limits=1), nullcontext(shared) if shared else Session() as session:
-            followed = followed_goal(scenario, self.law, self._images, plan, session)
+            followed = self.followed = followed_goal(scenario, self.law, self._images, plan, session)
             if followed is not None and self.course.mode != REGULATE:
                 raise InputError(f"{self.law} follows objects.{followed.tracked.name} in mode regulate alone")
             tracked = None if followed is None else followed.tracked
@@ -183,7 +184,7 @@ class LawRun:
             self.in_python(controller, driven, stall)
             if followed is not None and self.goal is not None and self.verdict == "followed":
                 go_on = partial(self._go_on, controller, driven, self.goal)
-                session.followed = followed.tracked.name, go_on
+                session.followed = FollowedObject(followed.tracked.name, go_on, followed)
 
     def _go_on(self, law: LoopLaw, driven: DrivenRobot, goal: GoalMonitor, seconds: float) -> None:
         """Follow the goal for a further time, s; raises WorkFailed if that fails."""
@@ -306,6 +307,11 @@ class LawRun:
         return self.scenario.ends.by_points().s_star if self.goal is None else self.goal.s_star
 
     @property
+    def images_at_end(self) -> TaskImages:
+        """Start and goal as the law measures them, the goal where it was at the end if it moved."""
+        return self.scenario.images_for(self.law) if self.goal is None else self.goal.here
+
+    @property
     def self_occluded_steps(self) -> tuple[int, ...]:
         """Number of times (V,) at which each camera is behind the face."""
         return tuple(np.count_nonzero(self.log.hidden[: self.steps + 1], axis=0).tolist())
@@ -323,9 +329,9 @@ class LawRun:
     def true_ends(self) -> Ends:
         """True poses of the tool, with the nearest goal to where it ended where incidences leave it open."""
         scenario, H = self.scenario, self.log.H[self.steps]
-        if self.goal is None or not self.goal.periods:
+        if self.goal is None or self.followed is None or not self.goal.periods:
             return scenario.world.nearest_ends(scenario.exact, scenario.true_ends, self.plant, H)
-        (T,), _ = scenario.world.true_motion(np.array([self.goal.periods[-1].t]))
+        (T,), _ = self.followed.true_motion(np.array([self.goal.periods[-1].t]))
         H = np.linalg.inv(T) @ H
         found = scenario.world.nearest_ends(scenario.exact, scenario.true_ends, self.plant, H)
         return found._replace(goal_pose=T @ found.goal_pose, goal=T @ found.goal)

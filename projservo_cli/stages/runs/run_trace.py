@@ -198,7 +198,7 @@ def _stated_mm(run: LawRun) -> dict[str, Any]:
         return {}
     numbers, q = scenario.numbers_of(run.law), run.log.read[run.steps]
     M = calibration.M[calibration.indices_of(numbers)]
-    s, s_star = run.log.s[run.steps], scenario.images_for(run.law).s_star
+    s, s_star = run.log.s[run.steps], run.images_at_end.s_star
     posture = Posture(scenario.world.model, q, M[:m], scenario.world.inputs.lengths)
     whole = np.isfinite(s[:, :m]).all(axis=(1, 2))
     if not posture.known or whole.sum() < scenario.world.min_views:
@@ -212,7 +212,10 @@ def _stated_mm(run: LawRun) -> dict[str, Any]:
         every = np.zeros((len(scenario.world.view), len(calibration.marker)), dtype=np.bool_)
         every[:, calibration.indices_of(numbers)] = used
         found["undetected_position_error_mm"] = run.driven.monitor.undetected_mm(q, every, posture)
-    if isinstance(run.plan, Plan) and run.plan.carried:
+    if run.goal is not None and run.followed is not None:
+        carried = run.followed.goal.carried(run.goal.periods[-1].t)
+        parts.append(0.0 if carried is None else carried.position_mm)
+    elif isinstance(run.plan, Plan) and run.plan.carried:
         parts += [one.goal_deviation_mm or 0.0 for one in run.plan.carried]
     elif (goal := scenario.goal_pixels) is not None:
         parts.append(rigid_fit(calibration, q, *goal).off_mm(posture, calibration.M))
@@ -221,9 +224,9 @@ def _stated_mm(run: LawRun) -> dict[str, Any]:
 
 def _of_goal(run: LawRun) -> GoalHistory | None:
     """Return the history of a goal that moved; None of one that stayed."""
-    if run.goal is None or not run.goal.periods:
+    if run.goal is None or run.followed is None or not run.goal.periods:
         return None
-    return history_of(run.goal, run.scenario.world, run.scenario.true_ends.goal, run.steps + 1)
+    return history_of(run.goal, run.followed, run.scenario.true_ends.goal, run.steps + 1)
 
 
 def _left(log: Log, steps: int) -> tuple[float | None, float | None]:

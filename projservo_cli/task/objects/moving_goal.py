@@ -7,7 +7,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from projservo_cli.geometry.kinematics import project
-from projservo_cli.records import FloatArray, Model
+from projservo_cli.records import FloatArray, Model, WorkFailed
+from projservo_cli.task.objects.displaced_object import CarriedGoal
+from projservo_cli.task.objects.object_bundle_adjustment import ObjectView
 from projservo_cli.task.objects.object_tracker import ObjectMotion, ObjectTracker
 from projservo_cli.task.target import Place, TaskImages
 
@@ -22,10 +24,22 @@ class MovingGoal:
     model: Model  # calibrated
     tracker: ObjectTracker
     whole: bool  # whether it is the whole pose, instead of incidences
+    D_planned: FloatArray  # (4, 4) of the object when the motion was planned
+    # Images of the markers of the calibration when it was taught; None of a retreat.
+    taught: ObjectView | None = None
 
     def moved(self, motion: ObjectMotion) -> FloatArray:
         """Displacement (4, 4) of the goal since the motion was planned."""
-        return np.asarray(motion.D @ np.linalg.inv(self.tracker.planned.D))
+        return np.asarray(motion.D @ np.linalg.inv(self.D_planned))
+
+    def carried(self, t: float) -> CarriedGoal | None:
+        """Return the goal at a time, s, with its errors; None of a retreat, or out of sight."""
+        if self.taught is None:
+            return None
+        try:
+            return self.tracker.carry(self.taught, t)
+        except WorkFailed:
+            return None
 
     @cached_property
     def H(self) -> FloatArray:
