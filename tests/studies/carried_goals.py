@@ -94,9 +94,12 @@ def seen(truth, X, normals=()):
     return True
 
 
-def scene(truth, goals, side, rng):
-    """Object (8, 4) when taught, tool (m, 4) at the goal, and the displacement (4, 4) of both."""
-    while True:
+def scene(truth, goals, side, rng, tries=10**9):
+    """Object (8, 4) when taught, tool (m, 4) at the goal, and the displacement (4, 4) of both.
+
+    None if none is found in some tries.
+    """
+    for _ in range(tries):
         tool = truth.M @ truth.displacement(goals[rng.integers(len(goals))]).T
         X, normals = tags(side)
         middle = tool[:, :3].mean(axis=0) + BESIDE * direction(rng)
@@ -118,6 +121,7 @@ def scene(truth, goals, side, rng):
             )
         ):
             return X, tool, T
+    return None
 
 
 def carried_pose(truth, s, tool):

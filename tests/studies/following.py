@@ -16,6 +16,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
 from projservo_cli.config.inputs import servo_inputs
 from projservo_cli.records import WorkFailed
@@ -25,8 +26,8 @@ from projservo_cli.stages.scenario import run_scenario
 from projservo_cli.stages.servo import drive
 from tests.configured import calibrate, plan, truth_of
 from tests.known import configured
-from tests.studies.carried_goals import direction, scene, seen
-from tests.studies.common import in_two_processes, parser_of, quantiles, written
+from tests.studies.carried_goals import carried_pose, direction, scene, seen
+from tests.studies.common import in_two_processes, parser_of, quantiles, rate, written
 
 ARMS = {"ur5": 530, "paper": 531}
 # Velocity of the object, mm/s along its direction and deg/s about an axis.
@@ -36,7 +37,11 @@ SIDE, NOISE_PX = 0.06, 0.5  # m
 KEPT, FARTHEST = np.radians(5.0), 1.5  # rad, of the joints from their limits and from the goal
 EDGE_ON = 0.2  # cosine of the angle of a camera from the normal of the face, at least
 PLACES = 5  # along half a motion
-COLUMNS = ("arm", "run", "periods", "motion", "verdict", "mm", "stated_px", "rms_px", "seconds", "failed")
+TRIES = 200  # to draw an object in sight beside a goal
+COLUMNS = (
+    *("arm", "run", "periods", "motion", "verdict", "mm", "stated_px", "rms_px", "seconds", "square"),
+    *("stated_mm", "kind", "failed"),
+)
 
 
 def displaced(motion, along, middle, t):
@@ -93,8 +98,9 @@ def task(arm, run):
     while True:
         for q in random_tasks(truth, front, 6, rng)[1]:
             for _ in range(5):
-                X, tool, _ = scene(truth, [q], SIDE, rng)
-                along = direction(rng)
+                if (found := scene(truth, [q], SIDE, rng, TRIES)) is None:
+                    break  # the tool there, or what is beside it, is nowhere in sight
+                (X, tool, _), along = found, direction(rng)
                 if in_sight(truth, X, tool, along) and in_reach(truth, q, X, along):
                     return q, X, along
 
@@ -146,6 +152,16 @@ def centre_mm(run, along_with):
     return 1e3 * np.linalg.norm(found.center - (along_with @ scenario.true_ends.goal)[:, :3], axis=1)
 
 
+def against_truth(run, t):
+    """χ² of the goal at a time, s, against where it truly is, by its stated errors; with the goal."""
+    truth, carried = run.scenario.world.truth, run.followed.goal.carried(t)
+    (T,), _ = run.followed.true_motion(np.array([t]))
+    H = T @ run.scenario.true_ends.goal_pose @ np.linalg.inv(run.scenario.true_ends.base_tool)
+    error, J = carried_pose(truth, carried.s, truth.M @ H.T)
+    changes = np.linalg.pinv(J) @ carried.changes.reshape(len(carried.changes), -1).T
+    return float(error @ np.linalg.solve(changes @ changes.T, error)), carried
+
+
 def one_run(config, calibration, *, follow):
     """Row of a run."""
     planned = plan.run(config, calibration)
@@ -160,7 +176,11 @@ def one_run(config, calibration, *, follow):
         return {"verdict": run.verdict}
     px, stated = run.goal.over_window
     mm = float(np.sqrt(np.mean(off[-len(window) :] ** 2)))
+    square, carried = against_truth(run, t[-1])
     return {
+        "square": square,
+        "stated_mm": carried.position_mm,
+        "kind": run.followed.goal.tracker.kind.name,
         "verdict": run.verdict,
         "mm": mm,
         "rms_px": px,
@@ -191,6 +211,17 @@ def rms(rows):
     return float(np.sqrt(np.mean([row["mm"] ** 2 for row in rows]))) if rows else np.nan
 
 
+def in_region(row):
+    """Whether the goal is in its 95 % region."""
+    return row["square"] <= chi2.ppf(0.95, 6)
+
+
+def kinds(rows):
+    """How often the motion was found to be of each kind."""
+    found = [row["kind"] for row in rows]
+    return ", ".join(f"{kind} {found.count(kind)}" for kind in sorted({*found}))
+
+
 def main():
     parser = parser_of(
         "following", __doc__, [("runs", 20, "of each arm and latency")], arms=ARMS, motions=MOTIONS
@@ -210,7 +241,8 @@ def main():
             followed = sum(row["verdict"] == "followed" for row in own if row["motion"] == motion)
             print(
                 f"  {motion}: followed {followed}; {rms(of):.2f} mm rms, {rms(of) / rms(still):.2f} of the "
-                f"still goal's ({rms(still):.2f}); {quantiles([row['mm'] for row in of])} mm",
+                f"still goal's ({rms(still):.2f}); {quantiles([row['mm'] for row in of])} mm; "
+                f"goal in its region {rate(sum(map(in_region, of)), len(of))} %; {kinds(of)}",
                 flush=True,
             )
     print("\n".join(sorted({f"  {row['motion']}: {row['failed']}" for row in rows if "failed" in row})[:10]))
