@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import AfterValidator, Field, StringConstraints
 
 from projservo_cli.image_size import ImageSize
-from projservo_cli.laws import REGULATE
+from projservo_cli.laws import IMAGE_TRACK, REGULATE
 from projservo_cli.records import LIMITS_MISSING, TOOL, WORLD, InputError, in_unit
 from projservo_cli.settings.calibration_and_refits import CalibrationSettings
 from projservo_cli.settings.cameras import Cameras
@@ -244,11 +244,9 @@ def _followed(
         if len(names) > 1:
             what = f"a goal that is followed is on one object, and this one on {' and '.join(names)}"
             yield ("task",), what
-        if control.mode != ("regulate",):
-            yield (
-                ("control", "mode"),
-                "plans lead to where an object was: a goal is followed by regulate alone",
-            )
+        if IMAGE_TRACK in control.mode:
+            what = "planned images are of the goal where it was: a goal is followed by regulate and track"
+            yield ("control", "mode"), what
         gains = {getattr(control, name) for name in ("gain_t", "gain_r", "gain_p", "gain_s", "gain")}
         if len(gains) > 1:
             what = "gains differ, and a goal that is followed is led by 1/gain: make all five the same"

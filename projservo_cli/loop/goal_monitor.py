@@ -5,12 +5,13 @@ along with the goal: λ (x* + v/λ − x) = λ (x* − x) + v. The law stays as 
 """
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
 from projservo_cli.control.law import State
-from projservo_cli.findings import REFUSES, Finding, Subject, from_text
+from projservo_cli.findings import NOTE, REFUSES, Finding, Subject, from_text
 from projservo_cli.geometry.kinematics import project
 from projservo_cli.image_size import within_images
 from projservo_cli.loop.python_loop import BuiltInLaw
@@ -33,6 +34,7 @@ from projservo_cli.loop.verdicts import (
 )
 from projservo_cli.records import MM, FloatArray, WorkFailed
 from projservo_cli.robots.latency_compensation import DrivenRobot
+from projservo_cli.task.face import Task
 from projservo_cli.task.incidences import image_error_at
 from projservo_cli.task.objects.moving_goal import MovingGoal
 
@@ -44,6 +46,8 @@ _LEARNT_S = 0.4
 _KEPT = 0.9
 # Consecutive periods in which a limit of an estimate is passed that count as passed.
 _SURE = 5
+# Periods between checks whether the goal will be where a plan leads, and share of the way by which not.
+_EVERY, _FREE = 10, 0.1
 # Time of a retreat from a goal that is lost, at most, s, and share of its way that is left out.
 _BACK_S, _LEFT_OUT = 3.0, 0.1
 
@@ -74,13 +78,24 @@ class GoalMonitor:
     """The goal of a run that moves: it leads the law, and rules by how well the goal is followed.
 
     ``periods``: the goal over time. ``since``: period from which on it is followed; None before.
-    ``here``: start and goal in the last period.
+    ``here``: start and goal in the last period. ``replannings``: when a plan to it was made again, and why.
     """
 
     def __init__(
-        self, law: BuiltInLaw, goal: MovingGoal, robot: DrivenRobot, limits: Limits, asked: FollowLimits
+        self,
+        law: BuiltInLaw,
+        goal: MovingGoal,
+        robot: DrivenRobot,
+        limits: Limits,
+        asked: FollowLimits,
+        plan: Callable[[Callable[[float], FloatArray], FloatArray], Task] | None = None,
+        attempts: int = 0,
     ) -> None:
         self._law, self._goal, self._robot, self._limits, self._asked = law, goal, robot, limits, asked
+        # Task with a plan from joints (n,) to where the displacement (4, 4) after some time, s, has the goal.
+        self._plan, self._attempts = plan, attempts  # how often it may be made again
+        self._leads_to: FloatArray | None = None  # displacement (4, 4) of the goal of the plan; None before
+        self.replannings: list[Finding] = []
         self.lead_s = 1.0 / (law.gains.gain_t * law.gains.scale)
         self.periods: list[Followed] = []
         self.since: int | None = None
@@ -110,7 +125,8 @@ class GoalMonitor:
         images = goal.at(D_ahead)
         self._ahead, self._turned = images.by_points().s_star, None
         try:
-            self._law.lead_to(images.task(self._law.law.model))
+            if self._law.arrives_in <= 0.0:  # else it goes to where the plan has the goal
+                self._law.lead_to(images.task(self._law.law.model))
         except WorkFailed as error:
             self._turned = from_text(str(error), REFUSES)
         self.here = goal.at(self._D)
@@ -194,9 +210,47 @@ class GoalMonitor:
             before = log.q_dot[k - 1] if k else np.zeros_like(q_dot)
             self._ends, self._given_up = (cause, before.copy(), 0), len(self.periods)
             return self._slowed(q_dot)
-        if verdict == WAITING:
-            return verdict
-        return self._followed(log, k)
+        try:
+            waits = verdict == WAITING or (self._plan is not None and self._replanned(log, k))
+        except WorkFailed as error:  # no plan leads to where the goal will be
+            self.reason, self._given_up = from_text(str(error), REFUSES), len(self.periods)
+            self._ends = OUT_OF_REACH, log.q_dot[k - 1].copy(), 0
+            return self._slowed(q_dot)
+        return WAITING if waits else self._followed(log, k)
+
+    def _replanned(self, log: Log, k: int) -> bool:
+        """Whether the arm waits for a plan, which is made once the velocity is learnt, and as it changes."""
+        if not self._leads:
+            return True
+        if self._leads_to is not None:
+            left_s = self._law.arrives_in * self._robot.robot.bounds.period / self._law.gains.scale
+            soon = left_s < _LEARNT_S  # the law goes the rest by itself
+            if soon or not self._attempts or k % _EVERY or not self._elsewhere(left_s):
+                return False
+            self._attempts -= 1
+            why = Subject(name="goal_elsewhere")
+            self.replannings.append(Finding("replanned", NOTE, why, k, unit="1"))
+        assert self._plan is not None
+        self._law.follow(self._plan(self._displaced_after, log.read[k]))
+        return True
+
+    def _displaced_after(self, seconds: float) -> FloatArray:
+        """Displacement (4, 4) of the goal after a time, s, which a plan then leads to."""
+        self._leads_to = self._goal.moved(self._goal.tracker.at(self._robot.steered.reading.t_q + seconds))
+        return self._leads_to
+
+    def _elsewhere(self, seconds: float) -> bool:
+        """Whether the goal will be elsewhere after a time, s, than the plan has it, beyond chance.
+
+        A plan keeps the way in sight and in reach, so the law may go a small share of the way without it.
+        """
+        assert self._leads_to is not None
+        motion = self._goal.tracker.at(self._robot.steered.reading.t_q + seconds)
+        D, planned = self._goal.moved(motion), self._leads_to
+        off = self._goal.at(D).s_star - self._goal.at(planned).s_star
+        sigma = self._goal.sigma_px(motion, D @ self._goal.H)
+        far = max(_WITHIN * math.hypot(sigma, self._limits.image_error_px), _FREE * self.periods[-1].error[0])
+        return float(np.sqrt(np.square(off).sum(axis=-1).mean())) > far
 
     def _followed(self, log: Log, k: int) -> int:
         """``FOLLOWED`` once the error stayed within its deviation for long enough."""

@@ -45,6 +45,7 @@ from projservo_cli.plugins import require_spelt
 from projservo_cli.records import FloatArray, Model, WorkFailed
 from projservo_cli.simulation.analytic_plant import Plant
 from projservo_cli.task.face import Task
+from projservo_cli.task.trajectory import NO_REFERENCE
 
 # Handing some forty arrays over to compiled code takes longer than a control step. They are handed over
 # once and kept in a structure of the compiler; a call then passes the pixels and the joints alone.
@@ -230,9 +231,14 @@ class BuiltInLaw:
         self._bound = None
 
     def lead_to(self, task: Task) -> None:
-        """Take another goal; the plan that is followed, and its time, stay."""
-        self.law = self.law._replace(task=self._weighed(task)._replace(reference=self.law.task.reference))
+        """Take another goal, without a plan."""
+        self.law = self.law._replace(task=self._weighed(task)._replace(reference=NO_REFERENCE))
         self._bound = None
+
+    @property
+    def arrives_in(self) -> float:
+        """Periods until the plan that is followed arrives; none, or less, without one."""
+        return len(self.law.task.reference.q) - 1 - float(self.state.plan.clock[0])
 
     def _weighed(self, task: Task) -> Task:
         """The task with the weights of this law, which ``weigh`` changes."""

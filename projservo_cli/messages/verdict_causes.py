@@ -121,6 +121,7 @@ _REPLANNED = {
     "face_back": "the face was lost, and seen again on the path backwards",
     "ahead": "the path ahead would leave an image",
     "goal_hidden": "the face is hidden at the end of the path",
+    "goal_elsewhere": "the goal will be elsewhere than the plan had it",
 }
 REASONS = {
     "converged": Row("{name} {amount} is within {limit}"),

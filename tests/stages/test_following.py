@@ -67,6 +67,42 @@ def test_a_law_moves_along_with_its_goal(law, velocity):
         assert trace.of_goal.goal_true_speed[1:] == pytest.approx(50.0, abs=1e-6)
 
 
+BEHIND = NEAR | {"translation_m": [-0.02, -0.15, 0.0]}
+TRACK = ("control.mode=[track]", "stop.max_steps=500", "control.joint_speed_limit_deg_s=60")
+
+
+@pytest.mark.parametrize("profile", ["linear", "joint_space"])
+def test_a_plan_leads_to_where_its_goal_will_be(profile):
+    """The part is 100 mm from where it was planned first when the arm arrives, which stays with it."""
+    run = driven(moving(BELT, *TRACK, f"trajectory.profile={profile}", displacement=BEHIND), "exact_track")
+    trace, off = trace_of(run), distances_mm(run)
+    assert (trace.verdict, trace.replan_attempts) == ("followed", 0), trace.reason
+    arrived = np.flatnonzero(off < 20.0)[0]
+    assert run.goal.periods[arrived].t < 1.8
+    assert off[arrived:].max() < 20.0
+    assert np.sqrt(np.mean(off[-25:] ** 2)) < 0.7
+
+
+def test_a_plan_is_made_again_where_its_goal_will_be_elsewhere():
+    """The part stops while the arm is under way, and moves on for 70 mm by the first estimate."""
+    rows = [[0.0] * 7, [0.9, 0, 70, 0, 0, 0, 0], [1.0, 0, 74, 0, 0, 0, 0]]
+    slow = (*TRACK[:2], "control.joint_speed_limit_deg_s=30")
+    run = driven(moving(None, *slow, displacement=BEHIND, path=rows), "exact_track")
+    trace = trace_of(run)
+    assert trace.verdict == "followed", trace.reason
+    assert trace.replan_attempts >= 1
+    assert "the goal will be elsewhere than the plan had it" in trace.reason
+    assert np.sqrt(np.mean(distances_mm(run)[-25:] ** 2)) < 0.7
+
+
+def test_a_goal_that_no_plan_reaches_is_out_of_reach_before_the_arm_moves():
+    away = {"translation_mm_s": [0.0, 900.0, 0.0]}
+    run = driven(moving(away, *TRACK, max_acceleration=20000.0, displacement=BEHIND), "exact_track")
+    assert run.verdict == "out of reach"
+    assert "no plan leads to where the goal will be" in trace_of(run).reason
+    np.testing.assert_array_equal(run.log.q_dot[: run.steps], 0.0)
+
+
 def test_latency_is_compensated():
     """At two periods, 50 mm/s would put the goal 4 mm behind."""
     late = "disturbance.camera_latency_s=0.08"
@@ -189,10 +225,8 @@ def test_a_pushed_part_ends_the_run():
 def test_laws_and_tasks_that_cannot_follow_are_refused():
     with pytest.raises(InputError, match=r"stacked cannot follow objects\.part"):
         driven(moving(BELT), "stacked")
-    with pytest.raises(InputError, match=r"exact follows objects\.part in mode regulate alone"):
-        driven(moving(BELT), "exact_track")
-    with pytest.raises(InputError, match="a goal is followed by regulate alone"):
-        moving(BELT, "control.mode=[regulate, track]")
+    with pytest.raises(InputError, match="a goal is followed by regulate and track"):
+        moving(BELT, "control.mode=[regulate, image_track]")
     with pytest.raises(InputError, match="led by 1/gain"):
         moving(BELT, "control.gain_s=1.0")
     with pytest.raises(InputError, match="gives its motion as velocity does"):

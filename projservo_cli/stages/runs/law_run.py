@@ -4,7 +4,7 @@ import copy
 import math
 from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Any, NamedTuple
 
@@ -39,11 +39,14 @@ from projservo_cli.records import (
     InputError,
     Model,
     Plan,
+    WorkFailed,
+    changed,
 )
 from projservo_cli.results import ImageModel
 from projservo_cli.robots.latency_compensation import DrivenRobot
 from projservo_cli.robots.session import FollowedObject, Session
 from projservo_cli.simulation.analytic_plant import AnalyticPlant, Ends, Plant
+from projservo_cli.stages import plan as planning
 from projservo_cli.stages.plan_motion import PathReplanner, search_of, why_closed
 from projservo_cli.stages.runs.followed_goal import FollowedGoal, followed_goal
 from projservo_cli.stages.runs.plugin_law import LawSetup, PluginLaw
@@ -51,9 +54,12 @@ from projservo_cli.stages.runs.robot_with_monitors import connected_robot
 from projservo_cli.stages.scenario import RunScenario
 from projservo_cli.task.face import Task, center_of
 from projservo_cli.task.incidences import whole_pose
+from projservo_cli.task.objects.moving_goal import MovingGoal
 from projservo_cli.task.target import TaskImages, followed
 
 _RETREAT = 10  # periods by which an arm goes back if the object of its goal moves
+# Plans to where a goal will be, at most, until their durations differ by less than this, s.
+_PLANS, _ALIKE_S = 4, 0.1
 _NOT_DRIVEN: Any = None  # replaces the results of a run
 
 
@@ -162,14 +168,12 @@ class LawRun:
         """
         scenario, contract = self.scenario, self.scenario.servo.required_contract
         scenario.world.require_ready()
-        controller = self.controller()
         shared, plan = self.brought.session, self.plan if isinstance(self.plan, Plan) else None
         # The matrices of a frame are small: a second thread costs more than it gives.
         with threadpool_limits(limits=1), nullcontext(shared) if shared else Session() as session:
             followed = self.followed = followed_goal(scenario, self.law, self._images, plan, session)
-            if followed is not None and self.course.mode != REGULATE:
-                raise InputError(f"{self.law} follows objects.{followed.tracked.name} in mode regulate alone")
             tracked = None if followed is None else followed.tracked
+            controller = self.controller()
             driven = connected_robot(scenario, self.law, session, self.brought.robot, plan, tracked)
             driven.stops = shared is None
             self.unseen = scenario.world.begin(
@@ -180,11 +184,36 @@ class LawRun:
             stall: StallMonitor | None = StallMonitor(driven, scenario.termination)
             if followed is not None and isinstance(controller, BuiltInLaw):
                 limits, stall = scenario.termination, None
-                self.goal = GoalMonitor(controller, followed.goal, driven, limits, followed.limits)
+                plans = plan is not None and plan.carried and not self.replans  # else a retreat
+                ahead = partial(self._plan_ahead, followed.goal) if plans else None
+                attempts, asked = scenario.servo.laws.max_replan_attempts, followed.limits
+                self.goal = GoalMonitor(controller, followed.goal, driven, limits, asked, ahead, attempts)
             self.in_python(controller, driven, stall)
             if followed is not None and self.goal is not None and self.verdict == "followed":
                 go_on = partial(self._go_on, controller, driven, self.goal)
                 session.followed = FollowedObject(followed.tracked.name, go_on, followed)
+
+    def _plan_ahead(self, goal: MovingGoal, displaced: Callable[[float], FloatArray], q: FloatArray) -> Task:
+        """Task with a plan from joints (n,) to where its goal will be when the plan arrives.
+
+        displaced : displacement (4, 4) of the goal after a time, s.
+        Raises WorkFailed if no feasible plan leads there.
+        """
+        assert isinstance(self.plan, Plan)
+        scenario, plan, seconds = self.scenario, self.plan, self.plan.duration
+        inputs, calibration = replace(scenario.world.inputs, q_current=q), scenario.world.calibration
+        model, (carried,) = self.believed or scenario.believed_by(self.law), plan.carried
+        for _ in range(_PLANS):
+            assert seconds is not None
+            images = goal.at(displaced(seconds / scenario.gains.scale))
+            there = replace(carried, s_carried=images.s_star)
+            plan = planning.run(inputs, calibration, changed(plan, carried=(there,)))
+            if not plan.feasible:
+                raise WorkFailed(f"no plan leads to where the goal will be: {plan.reason}")
+            before, seconds = seconds, plan.duration
+            if seconds is not None and abs(seconds - before) < _ALIKE_S:
+                break
+        return followed(model, images.task(model), plan, scenario.gains.period, scenario.gains.scale)
 
     def _go_on(self, law: LoopLaw, driven: DrivenRobot, goal: GoalMonitor, seconds: float) -> None:
         """Follow the goal for a further time, s; raises WorkFailed if that fails."""
@@ -202,7 +231,7 @@ class LawRun:
     ) -> None:
         """Drive a law on a plant, every command scaled; a run that is guided is watched."""
         scenario, execution = self.scenario, None
-        if self.is_guided and isinstance(law, BuiltInLaw):
+        if self.is_guided and isinstance(law, BuiltInLaw) and self.goal is None:
             assert isinstance(self.plan, Plan)
             follow, searches = partial(self._task, law.law.model), scenario.servo.laws.max_replan_attempts
             replanner = PathReplanner(scenario, self.plan)
@@ -237,6 +266,8 @@ class LawRun:
         if self.goal is not None:
             self.why = plant.disturbance or self.goal.reason
         self.replannings = () if execution is None else tuple(execution.attempts)
+        if self.goal is not None:
+            self.replannings = tuple(self.goal.replannings)
 
     def _task(self, model: Model, plan: Plan) -> Task:
         """The task as a built-in law with a model is given it, with the plan that it follows."""
@@ -263,7 +294,7 @@ class LawRun:
         """The built-in law with the model that it is given, and the sense of its rotations."""
         scenario, plan = self.scenario, self.plan
         model = self.believed or scenario.believed_by(self.law)
-        if self.replans:
+        if self.replans or self.followed is not None:
             task = self._images().task(model)
         else:
             assert isinstance(plan, Plan)
