@@ -425,7 +425,9 @@ _MOVES = {
 
 def _following(found: dict[str, Any]) -> str:
     """How an object moved, how near the tool stayed to its goal, and how well that is known."""
-    parts = [(" at", "speed_mm_s", "mm/s"), ("; the tool stayed within", "rms_mm", "mm rms of its goal")]
+    parts = [("; the tool stayed within", "rms_mm", "mm rms of its goal")]
+    if found["motion"] in ("belt", "free"):  # else its middle is at rest
+        parts.insert(0, (" at", "speed_mm_s", "mm/s"))
     parts += [(", and", "rms_deg", "deg"), ("; the goal is known to", "deviation_mm", "mm")]
     said = [f"{to} {found[key]:.2g} {unit}" for to, key, unit in parts if found[key] is not None]
     return f"the object {_MOVES[found['motion']]}{''.join(said)}"

@@ -79,6 +79,7 @@ class GoalMonitor:
 
     ``periods``: the goal over time. ``since``: period from which on it is followed; None before.
     ``here``: start and goal in the last period. ``replannings``: when a plan to it was made again, and why.
+    ``covered``: views that did not show the object as the others did, when some did so last.
     """
 
     def __init__(
@@ -96,6 +97,7 @@ class GoalMonitor:
         self._plan, self._attempts = plan, attempts  # how often it may be made again
         self._leads_to: FloatArray | None = None  # displacement (4, 4) of the goal of the plan; None before
         self.replannings: list[Finding] = []
+        self.covered: Finding | None = None
         self.lead_s = 1.0 / (law.gains.gain_t * law.gains.scale)
         self.periods: list[Followed] = []
         self.since: int | None = None
@@ -130,6 +132,7 @@ class GoalMonitor:
         except WorkFailed as error:
             self._turned = from_text(str(error), REFUSES)
         self.here = goal.at(self._D)
+        self.covered = goal.tracker.covered or self.covered
         self.s_star, now = self.here.by_points().s_star, self._now
         self.periods.append(
             Followed(

@@ -158,7 +158,8 @@ def test_a_goal_that_is_hidden_is_predicted_and_then_lost(monkeypatch):
         if verdict == "followed":
             assert distances_mm(run)[(unseen > 0.1)].max() < 3.0
     monkeypatch.setattr(ObjectTracker, "observe", hand_before_one_camera)
-    assert driven(moving(BELT)).verdict == "followed"
+    run = driven(moving(BELT))
+    assert (run.verdict, run.goal.covered) == ("followed", None)
     monkeypatch.setattr(ObjectTracker, "observe", covered)
     near = driven(moving(BELT, approach_mm=30.0))
     assert near.verdict == "lost goal"
@@ -171,6 +172,21 @@ def test_a_goal_that_is_hidden_is_predicted_and_then_lost(monkeypatch):
     there = trace.center[at_rest] + relative[came - 1] - relative[at_rest]
     assert 1e3 * np.linalg.norm(trace.center[near.steps] - there) < 5.0
     assert near.steps < at_rest + 40
+
+
+def test_a_view_that_shows_something_else_is_left_out_and_said(monkeypatch):
+    """A like tag held before the left camera for 0.5 s, 10 px beside."""
+    look = ObjectTracker.observe
+
+    def held_before_it(self, t, s, sigma=None):
+        off = 10.0 * (1.5 < t.max() < 2.0)
+        look(self, t, s + np.array([off, 0.0])[:, None, None] * [[[1.0, 0.0]]], sigma)
+
+    monkeypatch.setattr(ObjectTracker, "observe", held_before_it)
+    run = driven(moving(BELT))
+    assert run.verdict == "followed"
+    assert "part, markers 40 to 47, is covered in the left image" in trace_of(run).reason
+    assert np.sqrt(np.mean(distances_mm(run)[-25:] ** 2)) < 0.7
 
 
 def test_an_arm_goes_on_while_it_acts_and_then_holds_the_part():

@@ -345,7 +345,7 @@ def _reason(run: LawRun, joint: int, remaining: tuple[float | None, float | None
     if verdict == "followed" and run.goal is not None:
         errors, stated = run.goal.over_window
         yield replace(own, severity=NOTE, amount=errors, limit=stated)
-        yield from _unkept(run, at_step)
+        yield from (*_unkept(run, at_step), *_covered(run))
         return
     if verdict == "converged":
         yield replace(own, severity=NOTE, limit=within)
@@ -370,9 +370,16 @@ def _reason(run: LawRun, joint: int, remaining: tuple[float | None, float | None
         parts = [] if share is None else [Finding("share", amount=share, unit="1")]
         parts += [] if turn is None else [Finding("turn", amount=math.radians(turn), unit="rad")]
         yield replace(own, code="remaining", others=tuple(parts))
+    yield from _covered(run)
     yield from _blind_view(log.s[: steps + 1], run.scenario.world.view, limits.stall_periods)
     if run.driven is not None:
         yield from obstruction_of(run.driven.robot.robot)
+
+
+def _covered(run: LawRun) -> Iterator[Finding]:
+    """Tell which views of a followed object were left out, as they contradicted the others."""
+    if run.goal is not None and run.goal.covered is not None:
+        yield run.goal.covered
 
 
 def _grown(run: LawRun, own: Finding, at_step: Finding) -> Finding:
