@@ -323,7 +323,7 @@ class ObjectTracker:
         return _by(dt**4 / 4.0, dt**3 / 2.0, dt**2, self._limit**2)
 
     def _stepped(self, T: FloatArray, xi: FloatArray) -> FloatArray:
-        """Displacement (4, 4) after a step (g,)."""
+        """Displacement (..., 4, 4) after a step (..., g)."""
         return np.asarray(T @ expm(np.tensordot(xi, self._E, 1)))
 
     def _seen(
@@ -342,7 +342,7 @@ class ObjectTracker:
         V, g = len(s), len(self._E)
         bundle = self._rig.bundle([ObjectView(s)] * V, self._E)
         bundle = bundle._replace(weight=weight[None] * np.eye(V)[..., None])
-        poses = np.array([self._stepped(T, -one * rates) for one in ago])[None]
+        poses = self._stepped(T, -ago[:, None] * rates)[None]
         r, by_point = bundle.residuals(self._X[None], poses)
         each = np.arange(V)
         A = bundle.by_motion(by_point, self._X[None], poses)[0, each, each].reshape(V, -1, g)
@@ -509,7 +509,7 @@ class ObjectTracker:
         by_point = bundle.residuals(self._X[None], poses[None])[1]
         A = bundle.by_motion(by_point, self._X[None], poses[None])[0]
         B = by_point[0] @ poses[:, None, None, :, :3]
-        by_images, by_calibration = (np.einsum("lvkdi,kic->lvkdc", B, by, optimize=True) for by in self._X_by)
+        by_images, by_calibration = (B @ by for by in self._X_by)
         pixel = ALIKE_PX * np.eye(math.prod(shape)).reshape(*shape, -1)
         own = np.broadcast_to(pixel, (2, *pixel.shape))
         K = np.concatenate([by_images, by_calibration + pixels, own], axis=-1)
