@@ -42,8 +42,6 @@ from projservo_cli.task.objects.moving_goal import MovingGoal
 _WITHIN = 3.0
 # Time in which the velocity of an object is learnt, s: until then its goal is not led.
 _LEARNT_S = 0.4
-# Share of what set-points and readings showed of the lag of servos that the next period keeps.
-_KEPT = 0.9
 # Consecutive periods in which a limit of an estimate is passed that count as passed.
 _SURE = 5
 # Periods between checks whether the goal will be where a plan leads, and share of the way by which not.
@@ -103,9 +101,6 @@ class GoalMonitor:
         self.since: int | None = None
         self.reason: Finding | None = None
         self._fast = 0
-        # Where the arm came to rest when asked last, and sums of its lag times its speed, and of its square.
-        self._rest: FloatArray = np.zeros(0)
-        self._behind: FloatArray = np.zeros(2)
         self._turned: Finding | None = None  # why the law cannot be given the goal
         self._given_up: int | None = None  # period in which it was
         self._ends: tuple[int, FloatArray, int] | None = None  # verdict, last velocity, periods since
@@ -117,10 +112,7 @@ class GoalMonitor:
         """Give the law the goal where it will be, and return the images (V, m, 2) of the face where it is."""
         t, goal = self._robot.steered.reading.t_q, self._goal
         self._leads = bool(self.periods) and t - self.periods[0].t >= _LEARNT_S
-        # The law measures the arm where it will come to rest, its servos' lag later.
-        arrives = t + self._servo_lag_s(t)
-        self._now = goal.tracker.at(arrives)
-        ahead = goal.tracker.at(arrives + self.lead_s)
+        self._now, ahead = goal.tracker.at(t), goal.tracker.at(t + self.lead_s)
         self._D, D_ahead = goal.moved(self._now), goal.moved(ahead if self._leads else self._now)
         if self._back is not None:
             self._D = D_ahead = self._back[0]
@@ -146,17 +138,6 @@ class GoalMonitor:
             )
         )
         return self.s_star
-
-    def _servo_lag_s(self, t: float) -> float:
-        """Time by which joint readings follow the set-points of the last periods, at time t, s."""
-        rest, steered = self._robot.steered.set_point.at_rest, self._robot.steered
-        if self.periods and t > self.periods[-1].t:
-            speed = (rest - self._rest) / (t - self.periods[-1].t)
-            behind = float((rest - steered.reading.q) @ speed), float(speed @ speed)
-            self._behind = _KEPT * self._behind + behind
-        self._rest = rest
-        lag = self._behind[0] / self._behind[1] if self._behind[1] > 0.0 else 0.0
-        return min(max(lag, 0.0), self._robot.robot.bounds.max_servo_lag_s)
 
     def judge(self) -> float:
         """Return the image error of the tool as measured, px rms, against the goal where it is."""

@@ -143,7 +143,15 @@ class DrivenRobot:
             self.forces.append(self.robot.force())
             if self.forces[-1] > limit and not self.disturbance:
                 self.disturbance = Finding("pressed", REFUSES, amount=self.forces[-1], limit=limit, unit="N")
-        return self.steered.set_point.at_rest
+        return self._measured_at
+
+    @property
+    def _measured_at(self) -> FloatArray:
+        """Joints (n,) at which images are measured, rad or m: where the arm comes to rest.
+
+        An arm that follows never rests, and the sag of its servos changes on the way: where it is.
+        """
+        return self.steered.set_point.at_rest if self.tracked is None else self.steered.reading.q
 
     def observe(self) -> FloatArray:
         """Pixels (V, k, 2) of the markers shown as they will be at rest, NaN where unseen; all are tested."""
@@ -176,7 +184,7 @@ class DrivenRobot:
             if self._stale * self.robot.bounds.period > _STALE_S:
                 self.give_up()
             self._leave_out(self.monitor.rejected[:, self._place], stated is None)
-        q = self.steered.set_point.at_rest
+        q = self._measured_at
         there, *then = self.known.predicted(np.stack([q, *q_then]))[:, :, self._place]
         for view in range(len(then)):
             carries = not np.array_equal(q, q_then[view])
