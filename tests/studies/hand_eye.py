@@ -41,14 +41,20 @@ def intrinsics(P):
     return K @ np.diag(np.sign(np.diag(K)))
 
 
-def seen_pose(K, points, pixels):
-    """Pose (4, 4) of the tool in the frame of a camera from its points (m, 3), m, and pixels (m, 2)."""
+def seen_pose(K, points, pixels, near=None):
+    """Pose (4, 4) of the tool in the frame of a camera from its points (m, 3), m, and pixels (m, 2).
+
+    near : (4, 4) pose to begin with; None to look for one.
+    """
     seen = np.isfinite(pixels).all(axis=1)
     if seen.sum() < LEAST_POINTS:
         return None
-    found, turn, t = cv2.solvePnP(points[seen], pixels[seen], K, None, flags=cv2.SOLVEPNP_SQPNP)
-    if not found:
-        return None
+    if near is None:
+        found, turn, t = cv2.solvePnP(points[seen], pixels[seen], K, None, flags=cv2.SOLVEPNP_SQPNP)
+        if not found:
+            return None
+    else:
+        turn, t = cv2.Rodrigues(near[:3, :3])[0], near[:3, 3:].copy()
     turn, t = cv2.solvePnPRefineLM(points[seen], pixels[seen], K, None, turn, t)
     return _pose(cv2.Rodrigues(turn)[0], t)
 
@@ -71,7 +77,7 @@ def calibrated(P, points, hands, images):
     hands, tools = np.array([pair[0] for pair in pairs]), np.array([pair[1] for pair in pairs])
     found = []
     for name, base in _each_method(hands, tools):
-        mount = _mean(
+        mount = mean(
             [np.linalg.inv(hand) @ np.linalg.inv(base) @ T for hand, T in zip(hands, tools, strict=True)]
         )
         rms = _left_px(K, points, [base @ hand @ mount for hand in hands], [pair[2] for pair in pairs])
@@ -95,7 +101,7 @@ def _each_method(hands, tools):
         yield name, np.linalg.inv(_pose(*found))
 
 
-def _mean(poses):
+def mean(poses):
     """Mean of poses (k, 4, 4)."""
     poses = np.array(poses)
     return _pose(Rotation.from_matrix(poses[:, :3, :3]).mean().as_matrix(), poses[:, :3, 3].mean(axis=0))
@@ -110,17 +116,23 @@ def _left_px(K, points, tools, images):
     return float(np.sqrt(np.nanmean(np.square(left)) * 2.0))
 
 
-def tool_in_base(views, points, images):
-    """Pose (4, 4) of the tool in the base frame that pixels (2, m, 2) show, mean of the views that do."""
-    found = [(view, seen_pose(view.K, points, s)) for view, s in zip(views, images, strict=True)]
+def tool_in_base(views, points, images, near=None):
+    """Pose (4, 4) of the tool in the base frame that pixels (2, m, 2) show, mean of the views that do.
+
+    near : (4, 4) pose to begin with; None to look for one.
+    """
+    found = [
+        (view, seen_pose(view.K, points, s, None if near is None else view.base @ near))
+        for view, s in zip(views, images, strict=True)
+    ]
     shown = [np.linalg.inv(view.base) @ T for view, T in found if T is not None]
-    return _mean(shown) if shown else None
+    return mean(shown) if shown else None
 
 
 def mount_of(views, points, hands, images):
     """Pose (4, 4) of the tool on the hand, mean over poses (k, 4, 4) of it and pixels (k, 2, m, 2)."""
     tools = [tool_in_base(views, points, s) for s in images]
-    return _mean([np.linalg.inv(hand) @ T for hand, T in zip(hands, tools, strict=True) if T is not None])
+    return mean([np.linalg.inv(hand) @ T for hand, T in zip(hands, tools, strict=True) if T is not None])
 
 
 def joints_for(arm, hand, near):
