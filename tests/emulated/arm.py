@@ -79,7 +79,8 @@ class Arm:
         self.hand = q.copy()  # where somebody holds it while torque is off; None lets it fall
         self._hand_speed = HAND_SPEED
         self.overloaded_s = np.zeros(self.n)
-        self.displacement = np.eye(4)  # (4, 4) of the objects of the settings, in the base frame, m
+        # (4, 4) of the objects of the settings, in the base frame, m, or a function that gives it at a time
+        self.displacement = np.eye(4)
         self.lock, self._time = threading.RLock(), clock.now()
         self._past = deque([(self._time, q.copy())])
 

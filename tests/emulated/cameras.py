@@ -24,6 +24,7 @@ class _Unsearched(Frames):
 
     def _drawn(self, view, q, time):
         T, before = self._arm.displacement, self._kept.get(view)
+        T = T(time) if callable(T) else T
         if before is None or np.abs(before[0] - q).max() > _STILL or (before[1] != T).any():
             if self.rendered.scene.objects:
                 objects = self._model.body("scene with tags")
@@ -119,6 +120,6 @@ class Cameras:
         """One frame as JPEG."""
         import cv2
 
-        eyes.capture(view, self.arm.at(instant)[None], None, self._random)
+        eyes.capture(view, self.arm.at(instant)[None], None, self._random, np.array([instant]))
         image = np.roll(eyes.last[view], self.shift[view][::-1], axis=(0, 1))
         return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, self.optics.quality])[1].tobytes()
