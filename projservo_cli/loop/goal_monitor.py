@@ -182,6 +182,7 @@ class GoalMonitor:
         if self._ends is not None:
             return RUNNING if self._goes_back(log, k, verdict) else self._slowed(q_dot)
         if verdict in (JOINT_LIMIT, OUT_OF_VIEW):
+            self.reason = self._at_end(log, k, verdict)
             return OUT_OF_REACH
         if verdict == NO_PROGRESS or k == self._limits.max_steps:
             return MAX_STEPS
@@ -235,6 +236,15 @@ class GoalMonitor:
         sigma = self._goal.sigma_px(motion, D @ self._goal.H)
         far = max(_WITHIN * math.hypot(sigma, self._limits.image_error_px), _FREE * self.periods[-1].error[0])
         return float(np.sqrt(np.square(off).sum(axis=-1).mean())) > far
+
+    def _at_end(self, log: Log, k: int, verdict: int) -> Finding:
+        """Return which joint stands at its limit, or that the face left an image."""
+        if verdict == OUT_OF_VIEW:
+            return Finding("out_of_view", REFUSES, amount=float(k), unit="1")
+        joint = int(log.events[2])
+        unit = "m" if self._law.law.model.prismatic[joint] else "rad"
+        of = Subject(joints=(joint + 1,))
+        return Finding("joint_limit", REFUSES, of, float(log.read[k, joint]), unit=unit)
 
     def _followed(self, log: Log, k: int) -> int:
         """``FOLLOWED`` once the error stayed within its deviation for long enough."""

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from projservo_cli.config.inputs import objects_of, servo_inputs
+from projservo_cli.loop.verdicts import JOINT_LIMIT, OUT_OF_REACH, OUT_OF_VIEW
+from projservo_cli.messages import text
 from projservo_cli.records import InputError
 from projservo_cli.robots.session import Session
 from projservo_cli.stages import plan as planning
@@ -144,6 +146,14 @@ def test_a_goal_that_leaves_the_image_is_out_of_reach_before():
     trace = trace_of(run)
     assert (trace.verdict, trace.first_outside_image) == ("out of reach", -1), trace.reason
     assert "the goal leaves the image" in trace.reason or "beyond its limit" in trace.reason
+
+
+def test_a_joint_at_its_limit_and_a_face_that_left_an_image_are_named():
+    run = driven(moving(BELT))
+    run.log.events[2], still = 3, np.zeros(6)
+    for verdict, words in ((JOINT_LIMIT, "joint 4 stands at its limit"), (OUT_OF_VIEW, "left an image")):
+        assert run.goal.ruled(run.log, 9, verdict, still) == OUT_OF_REACH
+        assert words in text([run.goal.reason], run.setup)
 
 
 def test_a_goal_that_is_hidden_is_predicted_and_then_lost(monkeypatch):
