@@ -12,7 +12,7 @@ from projservo_cli.records import BoolArray, FloatArray, IntArray, Observation
 from projservo_cli.robots.contract import PluginRobot, Reading
 
 # Drift of a joint, rad or m, and of an image, px rms, within which both count as still.
-STILL, _STILL_PX = 2e-5, 0.02
+STILL, STILL_PX = 2e-5, 0.02
 _LEAST = 6  # readings that separate noise from motion
 _PATIENCE_S = 20.0  # for a robot to come to rest where it was sent
 _WAITED = 5  # looks for each image that is wanted, if the same one comes again
@@ -165,7 +165,7 @@ class Standstill:
             if rows[-1][0] < reading.t_q - self.seconds:
                 continue  # the same image all the time
             square, variance = _drift(frames[:, np.isfinite(frames).all(axis=0)])
-            if square.size and square.mean() > max(_STILL_PX**2, 2.0 * variance.mean()):
+            if square.size and square.mean() > max(STILL_PX**2, 2.0 * variance.mean()):
                 self.moving = self.moving or f"the {reading.view[view]} image"
             still = still and len(rows) >= _LEAST
         return still and not self.moving

@@ -274,3 +274,16 @@ class Carrying(Taking):
 
     def holding(self, name):
         return True
+
+
+class Passing(Carrying):
+    """Its time passes in looks too, as of a real robot, and its right camera is a look late."""
+
+    before = None
+
+    def read(self):
+        self.time += 0.05
+        q, s = super().read()
+        late = s[1].copy() if self.before is None else self.before
+        self.before = s[1].copy()
+        return q, np.stack([s[0], late])

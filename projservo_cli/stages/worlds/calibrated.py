@@ -33,7 +33,7 @@ from projservo_cli.robots.joint_limits import Joints
 from projservo_cli.robots.latency_compensation import DrivenRobot
 from projservo_cli.robots.pacing import Steered
 from projservo_cli.robots.session import Session
-from projservo_cli.robots.standstill import STILL, seen_at_rest
+from projservo_cli.robots.standstill import STILL, STILL_PX, seen_at_rest
 from projservo_cli.settings.task import GoalImages, TaskSettings
 from projservo_cli.simulation.analytic_plant import Ends, Plant
 from projservo_cli.simulation.ground_truth import turned
@@ -44,6 +44,7 @@ from projservo_cli.task.body_pose import NO_BODY, Body, make_body
 from projservo_cli.task.objects.object_bundle_adjustment import ObjectView
 from projservo_cli.task.target import TaskImages, is_stereo
 
+_LOOKS = 3  # at an object that may move, at least
 _UNKNOWN = Ends(np.full((4, 4), np.nan), np.full((4, 4), np.nan), np.full(4, np.nan))
 
 
@@ -54,6 +55,21 @@ class TruePoses(NamedTuple):
     goal_pose: FloatArray  # (4, 4) of the tool, m
     center: FloatArray  # (k, 3) of the face, m
     numbers: dict[str, float]  # numbers of a trace from these
+
+
+def _in_motion(readings: list[Reading], which: list[int]) -> ObjectView:
+    """Some markers, of which one of several readings shows the most, and which may move.
+
+    Views are taken at other times, up to a reading apart, so a marker is as uncertain as it moves meanwhile.
+    """
+    best = max(readings, key=lambda one: np.isfinite(one.s[:, which, 0]).sum())
+    s = np.array([one.s[:, which] for one in readings])
+    steps = np.linalg.norm(np.diff(s, axis=0), axis=-1)
+    moved = float(np.sqrt(np.mean(np.square(steps[np.isfinite(steps)])))) if np.isfinite(steps).any() else 0.0
+    sigma = None if best.sigma_px is None else best.sigma_px[:, which]
+    if moved > STILL_PX:
+        sigma = np.hypot(moved, np.zeros(best.s[:, which, 0].shape) if sigma is None else sigma)
+    return ObjectView(best.s[:, which], sigma)
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,8 +227,10 @@ class CalibratedWorld:
                 time.sleep(robot.bounds.period)
                 return robot.read().whole
 
+            which = [len(self.observed) + carrier.driven.further.index(number) for number in carrier.numbers]
+            if carrier.settings.follow:  # it need not rest, and a mean would be of several places
+                return _in_motion([observe() for _ in range(max(_LOOKS, rest.averaged_frames))], which)
             _, mean, sigma, *_ = seen_at_rest(robot, observe, rest.averaged_frames, rest.settle_s, "plan")
-        which = [len(self.observed) + carrier.driven.further.index(number) for number in carrier.numbers]
         return ObjectView(mean.s[:, which], sigma[:, which])
 
     def _observed_before(self, carrier: CarryingObject, q_taught: FloatArray | None) -> ObjectView:
