@@ -118,8 +118,8 @@ def test_the_lag_of_servos_is_led_too():
     """Servos that lag by 60 ms would stay 6 mm behind at 100 mm/s."""
     slow = "disturbance.servo_time_constant_s=0.06"
     back = NEAR | {"translation_m": [-0.02, -0.2, 0.0]}
-    config = moving({"translation_mm_s": [0.0, 100.0, 0.0]}, slow, displacement=back)
-    run = driven(config, calibration=calibrated(slow))
+    config = moving({"translation_mm_s": [0.0, 100.0, 0.0]}, slow, displacement=back, px=0.1)
+    run = driven(config, calibration=calibrate.run(config)[1])
     assert run.verdict == "followed"
     assert np.sqrt(np.mean(distances_mm(run)[-25:] ** 2)) < 1.0
 
