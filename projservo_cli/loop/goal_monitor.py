@@ -14,6 +14,7 @@ from projservo_cli.control.law import State
 from projservo_cli.findings import NOTE, REFUSES, Finding, Subject, from_text
 from projservo_cli.geometry.kinematics import project
 from projservo_cli.image_size import within_images
+from projservo_cli.loop.goal_ending import Ending
 from projservo_cli.loop.python_loop import BuiltInLaw
 from projservo_cli.loop.verdicts import (
     CONVERGED,
@@ -36,7 +37,7 @@ from projservo_cli.records import MM, FloatArray, WorkFailed
 from projservo_cli.robots.latency_compensation import DrivenRobot
 from projservo_cli.task.face import Task
 from projservo_cli.task.incidences import image_error_at
-from projservo_cli.task.objects.moving_goal import MovingGoal
+from projservo_cli.task.objects.moving_goal import Followed, MovingGoal
 
 # Rms of the errors over their stated deviation that counts as followed.
 _WITHIN = 3.0
@@ -46,8 +47,6 @@ _LEARNT_S = 0.4
 _SURE = 5
 # Periods between checks whether the goal will be where a plan leads, and share of the way by which not.
 _EVERY, _FREE = 10, 0.1
-# Time of a retreat from a goal that is lost, at most, s, and share of its way that is left out.
-_BACK_S, _LEFT_OUT = 3.0, 0.1
 
 
 class FollowLimits(NamedTuple):
@@ -57,19 +56,6 @@ class FollowLimits(NamedTuple):
     max_speed: float  # of its object, mm/s, or px/s if no length is known
     lost_s: float  # for which its motion is predicted, s
     approach_mm: float  # distance of the tool from the goal within which no motion is predicted
-
-
-class Followed(NamedTuple):
-    """The goal in a period of a run."""
-
-    t: float  # by the clock of the robot, s
-    D: FloatArray  # (4, 4) displacement of the goal since the motion was planned
-    s_star: FloatArray  # (V, m, 2) px of the face there
-    error: tuple[float, float, float]  # px, mm and deg of the tool from the goal
-    sigma_px: float  # stated deviation of the error
-    speed: float  # of the object, mm/s or px/s
-    unseen_s: float  # since its object was seen
-    H: FloatArray = np.full((4, 4), np.nan)  # of the tool as measured
 
 
 class GoalMonitor:
@@ -103,10 +89,7 @@ class GoalMonitor:
         self._fast = 0
         self._turned: Finding | None = None  # why the law cannot be given the goal
         self._given_up: int | None = None  # period in which it was
-        self._ends: tuple[int, FloatArray, int] | None = None  # verdict, last velocity, periods since
-        # Displacement (4, 4) of the goal to which the arm retreats, and when that began; None if it does not.
-        self._back: tuple[FloatArray, float] | None = None
-        self._retreats = True  # whether it may
+        self._ending: Ending | None = None  # of a run without its goal
 
     def lead(self) -> FloatArray:
         """Give the law the goal where it will be, and return the images (V, m, 2) of the face where it is."""
@@ -114,8 +97,8 @@ class GoalMonitor:
         self._leads = bool(self.periods) and t - self.periods[0].t >= _LEARNT_S
         self._now, ahead = goal.tracker.at(t), goal.tracker.at(t + self.lead_s)
         self._D, D_ahead = goal.moved(self._now), goal.moved(ahead if self._leads else self._now)
-        if self._back is not None:
-            self._D = D_ahead = self._back[0]
+        if self._ending is not None and self._ending.D_back is not None:
+            self._D = D_ahead = self._ending.D_back
         images = goal.at(D_ahead)
         self._ahead, self._turned = images.by_points().s_star, None
         try:
@@ -177,10 +160,8 @@ class GoalMonitor:
 
     def ruled(self, log: Log, k: int, verdict: int, q_dot: FloatArray) -> int:
         """Return the new verdict; the arm slows down before it ends a run without its goal."""
-        if self._ends is not None and k == self._limits.max_steps:
-            return self._ends[0]
-        if self._ends is not None:
-            return RUNNING if self._goes_back(log, k, verdict) else self._slowed(q_dot)
+        if self._ending is not None:
+            return self._ending.ruled(log, k, verdict, q_dot)
         if verdict in (JOINT_LIMIT, OUT_OF_VIEW):
             self.reason = self._at_end(log, k, verdict)
             return OUT_OF_REACH
@@ -191,20 +172,21 @@ class GoalMonitor:
         if verdict not in (RUNNING, CONVERGED, WAITING):
             return verdict
         cause = self._cause(log, k, q_dot)
-        if cause != RUNNING:
-            before = log.q_dot[k - 1] if k else np.zeros_like(q_dot)
-            self._ends, self._given_up = (cause, before.copy(), 0), len(self.periods)
-            return self._slowed(q_dot)
         try:
-            waits = verdict == WAITING or (self._plan is not None and self._replanned(log, k))
+            waits = verdict == WAITING or (cause == RUNNING and self._replanned(log, k))
         except WorkFailed as error:  # no plan leads to where the goal will be
-            self.reason, self._given_up = from_text(str(error), REFUSES), len(self.periods)
-            self._ends = OUT_OF_REACH, log.q_dot[k - 1].copy(), 0
-            return self._slowed(q_dot)
+            cause, self.reason = OUT_OF_REACH, from_text(str(error), REFUSES)
+        if cause != RUNNING:
+            self._given_up = len(self.periods)
+            near_mm = self._asked.approach_mm
+            self._ending = Ending(cause, self._goal, self.periods, self._robot, self._limits, near_mm)
+            return self._ending.ruled(log, k, verdict, q_dot)
         return WAITING if waits else self._followed(log, k)
 
     def _replanned(self, log: Log, k: int) -> bool:
         """Whether the arm waits for a plan, which is made once the velocity is learnt, and as it changes."""
+        if self._plan is None:
+            return False
         if not self._leads:
             return True
         if self._leads_to is not None:
@@ -215,7 +197,6 @@ class GoalMonitor:
             self._attempts -= 1
             why = Subject(name="goal_elsewhere")
             self.replannings.append(Finding("replanned", NOTE, why, k, unit="1"))
-        assert self._plan is not None
         self._law.follow(self._plan(self._displaced_after, log.read[k]))
         return True
 
@@ -302,41 +283,3 @@ class GoalMonitor:
             self.reason = Finding("goal_leaves_reach", REFUSES, of, ahead_s, unit="s")
             return OUT_OF_REACH
         return RUNNING
-
-    def _slowed(self, q_dot: FloatArray) -> int:
-        """Slow the arm down within its limits; the verdict once it is at rest."""
-        assert self._ends is not None
-        verdict, before, periods = self._ends
-        bounds = self._robot.robot.bounds
-        periods_each = np.abs(before) / (bounds.limits.acceleration * bounds.period)
-        needed = max(1, math.ceil(float(periods_each.max())))
-        self._ends = verdict, before, periods + 1
-        q_dot[:] = before * (1.0 - (periods + 1) / needed)
-        if periods + 1 < needed or self._begins_back(verdict):
-            return RUNNING
-        return verdict
-
-    def _begins_back(self, verdict: int) -> bool:
-        """Whether the arm, at rest near a goal that is lost, begins to retreat: as it came to its object."""
-        H_star, near = self._goal.H, self._asked.approach_mm
-        measured = [one for one in self.periods if np.isfinite(one.H).all()]
-        if verdict != LOST_GOAL or not self._retreats or not measured[-1].error[1] < near:
-            return False
-        far = next((one for one in reversed(measured) if not one.error[1] < near), measured[0])
-        relative = np.linalg.solve(far.D @ H_star, far.H)
-        D = measured[-1].D @ H_star @ relative @ np.linalg.inv(H_star)
-        self._back, self._retreats = (D, self.periods[-1].t), False
-        return True
-
-    def _goes_back(self, log: Log, k: int, verdict: int) -> bool:
-        """Whether the arm retreats; it slows down once it is there, or can go no farther."""
-        if self._back is None:
-            return False
-        now, began = self.periods[-1], self._back[1]
-        way = next(one.error[0] for one in self.periods if one.t > began)
-        left = max(_LEFT_OUT * way, tolerance(self._limits, float(log.fit[k, 2]), self._robot.noise_ratio))
-        if verdict in (RUNNING, CONVERGED, WAITING) and now.t < began + _BACK_S and not now.error[0] < left:
-            return True
-        assert self._ends is not None
-        self._back, self._ends = None, (self._ends[0], log.q_dot[k - 1].copy(), 0)
-        return False

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -14,6 +15,19 @@ from projservo_cli.task.objects.object_tracker import ObjectMotion, ObjectTracke
 from projservo_cli.task.target import Place, TaskImages
 
 _STEP = 1e-5  # of a difference, in a coordinate of a motion
+
+
+class Followed(NamedTuple):
+    """The goal in a period of a run."""
+
+    t: float  # by the clock of the robot, s
+    D: FloatArray  # (4, 4) displacement of the goal since the motion was planned
+    s_star: FloatArray  # (V, m, 2) px of the face there
+    error: tuple[float, float, float]  # px, mm and deg of the tool from the goal
+    sigma_px: float  # stated deviation of the error
+    speed: float  # of the object, mm/s or px/s
+    unseen_s: float  # since its object was seen
+    H: FloatArray = np.full((4, 4), np.nan)  # of the tool as measured
 
 
 @dataclass(frozen=True, eq=False)
