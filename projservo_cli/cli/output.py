@@ -424,7 +424,7 @@ _MOVES = {
 
 
 def _following(found: dict[str, Any]) -> str:
-    """How an object moved, how near the tool stayed to its goal, and how well that is known."""
+    """Motion of an object, distance of the tool from its goal, and deviation of that."""
     parts = [("; the tool stayed within", "rms_mm", "mm rms of its goal")]
     if found["motion"] in ("belt", "free"):  # else its middle is at rest
         parts.insert(0, (" at", "speed_mm_s", "mm/s"))

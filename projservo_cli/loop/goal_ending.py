@@ -1,4 +1,4 @@
-"""How a run without its goal ends: the arm slows down, and near a lost object goes back as it came."""
+"""The end of a run without its goal: the arm slows down, and near a lost object goes back as it came."""
 
 import math
 from collections.abc import Sequence
@@ -10,7 +10,7 @@ from projservo_cli.records import FloatArray
 from projservo_cli.robots.latency_compensation import DrivenRobot
 from projservo_cli.task.objects.moving_goal import Followed, MovingGoal
 
-# Time of a retreat from a goal that is lost, at most, s, and share of its way that is left out.
+# Time of a retreat from a goal that is lost, at most, s, and share of its path that is left out.
 _BACK_S, _LEFT_OUT = 3.0, 0.1
 
 
@@ -74,7 +74,7 @@ class Ending:
         return True
 
     def _is_back(self, log: Log, k: int) -> bool:
-        """Whether the arm went back all but a share of the way, or for long enough."""
-        now, way = self._periods[-1], next(one.error[0] for one in self._periods if one.t > self._began)
-        left = max(_LEFT_OUT * way, tolerance(self._limits, float(log.fit[k, 2]), self._robot.noise_ratio))
+        """Whether the arm went back all but a share of its path, or for long enough."""
+        now, whole = self._periods[-1], next(one.error[0] for one in self._periods if one.t > self._began)
+        left = max(_LEFT_OUT * whole, tolerance(self._limits, float(log.fit[k, 2]), self._robot.noise_ratio))
         return now.t >= self._began + _BACK_S or now.error[0] < left

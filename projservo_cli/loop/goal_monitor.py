@@ -45,7 +45,7 @@ _WITHIN = 3.0
 _LEARNT_S = 0.4
 # Consecutive periods in which a limit of an estimate is passed that count as passed.
 _SURE = 5
-# Periods between checks whether the goal will be where a plan leads, and share of the way by which not.
+# Periods between checks whether the goal will be where a plan leads, and share of the path by which not.
 _EVERY, _FREE = 10, 0.1
 
 
@@ -208,7 +208,7 @@ class GoalMonitor:
     def _elsewhere(self, seconds: float) -> bool:
         """Whether the goal will be elsewhere after a time, s, than the plan has it, beyond chance.
 
-        A plan keeps the way in sight and in reach, so the law may go a small share of the way without it.
+        A plan keeps the arm in sight and in reach, so the law may go a small share of the path without it.
         """
         assert self._leads_to is not None
         motion = self._goal.tracker.at(self._robot.steered.reading.t_q + seconds)

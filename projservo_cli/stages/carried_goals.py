@@ -84,7 +84,7 @@ def _carried(scenario: Scenario, carrier: CarryingObject, session: Session | Non
         s_carried=np.ascontiguousarray(goal.s[:, c.indices_of(scenario.world.numbers)]),
         M_object=_in_body(found, goal.H, carrier.numbers),
     )
-    # One that is followed is found anew while it moves.
+    # One that is followed is found again while it moves.
     for unit in () if carrier.settings.follow else ("mm", "px"):
         key, at = f"max_goal_deviation_{unit}", getattr(carried, f"goal_deviation_{unit}")
         if at is not None and at > (most := getattr(limits, key)):
