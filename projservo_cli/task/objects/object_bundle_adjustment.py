@@ -173,8 +173,9 @@ class Bundle(NamedTuple):
 
     def by_motion(self, by_point: FloatArray, X: FloatArray, T: FloatArray) -> FloatArray:
         """Derivatives (B, L, V, k, 2, g) by displacements, from those by points; as above."""
-        before = np.tensordot(X, self.E, (2, 2)).swapaxes(2, 3)[:, None]  # (B, 1, k, 4, g)
-        return np.asarray(by_point @ (T[:, :, None] @ before)[:, :, None])
+        velocity = np.einsum("blij,gjm,bkm->blkgi", T, self.E, X, optimize=True)
+        by_motion: FloatArray = np.einsum("blvkdi,blkgi->blvkdg", by_point, velocity, optimize=True)
+        return by_motion
 
     def linearized(self, X: FloatArray, T: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Residuals (B, N), and derivatives (B, N, p) of pixels, both over their deviation."""
