@@ -3,10 +3,14 @@
 from dataclasses import replace
 
 from projservo_cli.config import load_config
+from projservo_cli.planning.goal_configurations import GoalFeatures
+from projservo_cli.planning.joint_constraints import constraints_of
+from projservo_cli.planning.keep_out import NO_KEEP_OUT
 from projservo_cli.settings.sections import JointVector
 from projservo_cli.stages.plan import plan_task
 from projservo_cli.stages.runs.run_trace import trace_of
 from projservo_cli.stages.servo import drive
+from projservo_cli.task.target import TargetGoal, TaskImages
 from tests.configured import scenario_of, trajectory_of
 from tests.conftest import ROOT
 
@@ -49,3 +53,12 @@ def driven(scenario, plan, name, model, **limits):
     """Trace of the run of a name with a model; ``limits`` replace those of the scenario."""
     scenario = replace(scenario, termination=scenario.termination._replace(**limits))
     return trace_of(drive(scenario, plan, name, model))
+
+
+def true_search(truth, ends, demands, *, pins=(), keep_out=NO_KEEP_OUT):
+    """Constraints of a motion of face and pins from joints (n,) to others, and its aim, by the true model."""
+    s_start, s_star = (truth.images(q, truth.M_face) for q in ends)
+    task = TaskImages(ends[0], s_start, TargetGoal.at(s_star), truth.center).task(truth.model)
+    A = truth.M[[*truth.face, *pins]] @ truth.displacement(ends[0]).T
+    c = constraints_of(truth.model, A, task, ends[0], demands, keep_out)
+    return c, GoalFeatures(task.A_star, s_star, 0.0)

@@ -6,12 +6,11 @@ from typing import NamedTuple
 import numpy as np
 
 from projservo_cli.planning.goal_configurations import GoalFeatures
-from projservo_cli.planning.joint_constraints import Constraints, constraints_of
+from projservo_cli.planning.joint_constraints import Constraints
 from projservo_cli.planning.motion_margins import Demands
 from projservo_cli.simulation.random_tasks import random_tasks
-from projservo_cli.task.target import TargetGoal, TaskImages
 from tests.configured import joints_of, truth_of
-from tests.known import configured
+from tests.known import configured, true_search
 
 COUNT = 12
 
@@ -37,13 +36,9 @@ def _drawn(name):
 def case(name, k):
     """Random task k of a configuration."""
     truth, joints, tasks = _drawn(name)
-    q_start, q_goal = tasks[0][k], tasks[1][k]
-    s_start, s_star = (truth.images(q, truth.M_face) for q in (q_start, q_goal))
-    task = TaskImages(q_start, s_start, TargetGoal.at(s_star), truth.center).task(truth.model)
-    A = truth.M_face @ truth.displacement(q_start).T
+    ends = tasks[0][k], tasks[1][k]
     speed = np.where(np.isfinite(joints.limits.speed), joints.limits.speed, 1.0)
     keep = np.array([0.002 if kind == "P" else np.radians(1.0) for kind in joints.types])
     limits = joints.limits._replace(speed=speed)
     demands = Demands(limits, truth.image_size, 5.0, 0.0, keep, 8.0)
-    c = constraints_of(truth.model, A, task, q_start, demands)
-    return Case(truth, q_start, q_goal, c, GoalFeatures(task.A_star, s_star, 0.0))
+    return Case(truth, *ends, *true_search(truth, ends, demands))

@@ -12,14 +12,11 @@ import numpy as np
 from scipy.stats import binomtest
 from tqdm import tqdm
 
-from projservo_cli.planning.goal_configurations import GoalFeatures
-from projservo_cli.planning.joint_constraints import constraints_of
 from projservo_cli.planning.motion_margins import limits_alone
 from projservo_cli.planning.rrt_connect import SearchLimits, find_path
 from projservo_cli.simulation.random_tasks import random_tasks
-from projservo_cli.task.target import TargetGoal, TaskImages
 from tests.configured import calibrate, joints_of, truth_of
-from tests.known import configured, with_task
+from tests.known import configured, true_search, with_task
 
 # Configurations with images of 0.5 px noise, each with a seed of its own for its tasks.
 ARMS = {"paper": 151, "ur5": 152, "stanford": 153, "seven": 154}
@@ -64,24 +61,19 @@ def row_of(ends):
     return {f"{end}_q{i}": repr(float(x)) for end, q in named for i, x in enumerate(q, 1)}
 
 
-def true_search(config, *, margins=False):
+def search_of(config, *, margins=False):
     """Constraints, aim and joints at both ends of a task by the true model.
 
     margins : whether it keeps those of the configuration; else none, and a border of 0.
     """
     truth, joints, asked = truth_of(config), joints_of(config), config.trajectory
-    start, goal = config.task.start, config.task.goal.joints
-    q_start, q_goal = (np.array(q.values(config.joint_types)) for q in (start, goal))
-    s_start, s_star = (truth.images(q, truth.M_face) for q in (q_start, q_goal))
-    task = TaskImages(q_start, s_start, TargetGoal.at(s_star), truth.center).task(truth.model)
-    A = truth.M_face @ truth.displacement(q_start).T
+    ends = tuple(np.array(q.values(config.joint_types)) for q in (config.task.start, config.task.goal.joints))
     demands = limits_alone(joints.limits)._replace(image_size=truth.image_size)
     if margins:
         deg = np.radians(asked.joint_margin_deg)
         keep = np.array([asked.joint_margin_m if kind == "P" else deg for kind in joints.types])
         demands = demands._replace(border_px=asked.border_px, min_face_px=asked.min_face_px, keep=keep)
-    c = constraints_of(truth.model, A, task, q_start, demands)
-    return c, GoalFeatures(task.A_star, s_star, 0.0), q_start, q_goal
+    return *true_search(truth, ends, demands), ends
 
 
 def parser_of(study, about, numbers=(), **choices):
@@ -106,11 +98,10 @@ def asked_for(study, about, tasks, arms=tuple(ARMS), counted="of each arm"):
     return parser_of(study, about, [("tasks", tasks, counted)], arms=(ARMS, list(arms))).parse_args()
 
 
-def has_no_way(config):
+def has_no_way(c, aim, ends):
     """Whether no search with the true model finds a way."""
-    c, aim, q_start, q_goal = true_search(config)
     return not any(
-        len(find_path(c, aim, q_start, q_goal[None], SearchLimits(SAMPLES, seed)).corners)
+        len(find_path(c, aim, ends[0], ends[1][None], SearchLimits(SAMPLES, seed)).corners)
         for seed in range(SEARCHES)
     )
 

@@ -17,11 +17,9 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from projservo_cli.geometry.stereo import optical_centers
-from projservo_cli.planning.goal_configurations import GoalFeatures
-from projservo_cli.planning.joint_constraints import constraints_of
 from projservo_cli.planning.keep_out import keep_out_of
 from projservo_cli.planning.motion_margins import limits_alone
-from projservo_cli.planning.rrt_connect import SearchLimits, find_path, within_region
+from projservo_cli.planning.rrt_connect import within_region
 from projservo_cli.records import WorkFailed
 from projservo_cli.settings.task import KeptOut
 from projservo_cli.simulation.arm import METRIC_A_INF
@@ -30,16 +28,13 @@ from projservo_cli.simulation.random_tasks import random_tasks
 from projservo_cli.stages.runs.run_trace import trace_of
 from projservo_cli.stages.servo import drive
 from projservo_cli.stages.worlds.simulated import SimulatedWorld
-from projservo_cli.task.target import TargetGoal, TaskImages
 from tests.configured import calibrate, joints_of, plan, scenario_of, truth_of
-from tests.known import configured, with_task
-from tests.studies.common import rate
+from tests.known import configured, true_search, with_task
+from tests.studies.common import has_no_way, rate
 
 ARMS = {"paper": 67, "ur5": 67, "stanford": 66}
 SEEDS = {"paper": (15, 5, 1), "ur5": (15, 5, 2), "stanford": (15, 5, 3)}
 HALF_M = (0.02, 0.05)  # of the edges of a box
-# Searches with the true model for a way where a task failed: draws of each, and how many seeds.
-ESCALATED = ((20_000, 3), (100_000, 20))
 
 
 class Box(NamedTuple):
@@ -65,8 +60,7 @@ class Box(NamedTuple):
 class Drawn(NamedTuple):
     """A task with a box in its way."""
 
-    q_start: np.ndarray
-    q_goal: np.ndarray  # q_start, q_goal: (n,) rad or m
+    ends: tuple[np.ndarray, np.ndarray]  # (n,) rad or m
     box: Box
     regions: tuple[KeptOut, ...]
 
@@ -149,42 +143,18 @@ def with_box(config, truth: Truth, ends, rng):
         if met(truth, box, both).any() or hidden(truth, box, both).any():
             continue
         corners = [tuple((float(u), float(v)) for u, v in polygon) for polygon in drawn]
-        task = Drawn(*ends, box, (KeptOut(left=corners[0], right=corners[1]),))
-        if all(within_region(true_constraints(config, truth, task, q), q) == 0 for q in ends):
-            return task
+        regions = (KeptOut(left=corners[0], right=corners[1]),)
+        starts = (search_around(config, truth, (q, ends[1]), regions)[0] for q in ends)
+        if all(within_region(c, q) == 0 for c, q in zip(starts, ends, strict=True)):
+            return Drawn(ends, box, regions)
     return None
 
 
-def true_constraints(config, truth: Truth, task: Drawn, q):
-    """What joints are held against from joints (n,) on: the true model, border 0, limits without margin."""
-    s_start, s_star = (truth.images(x, truth.M_face) for x in (q, task.q_goal))
-    aimed = TaskImages(q, s_start, TargetGoal.at(s_star), truth.center).task(truth.model)
-    joints = joints_of(config)
-    demands = limits_alone(joints.limits)._replace(image_size=truth.image_size)
-    A = truth.M[[*truth.face, *truth.pins]] @ truth.displacement(q).T
-    c = constraints_of(truth.model, A, aimed, q, demands)
-    return c._replace(
-        full=np.r_[0.0, c.full[1:]],
-        keep_out=keep_out_of([((region.left, region.right), region.occludes) for region in task.regions]),
-    )
-
-
-def way_exists(config, truth: Truth, task: Drawn):
-    """Whether a way through the polygons is found with the true model, and after how many searches."""
-    c = true_constraints(config, truth, task, task.q_start)
-    s_star = truth.images(task.q_goal, truth.M_face)
-    aimed = TaskImages(
-        task.q_start, truth.images(task.q_start, truth.M_face), TargetGoal.at(s_star), truth.center
-    )
-    aim = GoalFeatures(aimed.task(truth.model).A_star, s_star, 0.0)
-    searches = 0
-    for samples, seeds in ESCALATED:
-        for seed in range(seeds):
-            how = SearchLimits(samples, seed, 4096)
-            searches += 1
-            if len(find_path(c, aim, task.q_start, task.q_goal[None], how).corners):
-                return True, searches
-    return False, searches
+def search_around(config, truth: Truth, ends, regions):
+    """Constraints and aim from joints (n,) to others, around regions: border 0, limits without margin."""
+    demands = limits_alone(joints_of(config).limits)._replace(image_size=truth.image_size)
+    keep_out = keep_out_of([((region.left, region.right), region.occludes) for region in regions])
+    return true_search(truth, ends, demands, pins=truth.pins, keep_out=keep_out)
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,7 +190,7 @@ def driven_behind(scenario, planned, truth: Truth, box: Box):
 def judged(config, calibration, truth: Truth, task: Drawn, tally):
     """What is wrong with how a task ends, in words; what else befell it is counted."""
     motion = config.trajectory.model_copy(update={"keep_out": task.regions})
-    config = with_task(config, (task.q_start, task.q_goal), trajectory=motion)
+    config = with_task(config, task.ends, trajectory=motion)
     try:
         planned = plan.run(config, calibration)
     except WorkFailed as error:
@@ -262,11 +232,11 @@ def study(name, count, profile):
     for k, task in enumerate(tasks):
         wrong = judged(config.model_copy(update={"seed": k}), calibration, truth, task, tally)
         good += not wrong
-        exists, searches = (True, 0) if not wrong else way_exists(config, truth, task)
-        ways += exists
+        search = search_around(config, truth, task.ends, task.regions)
+        lost = bool(wrong) and has_no_way(*search, task.ends)
+        ways += not lost
         if wrong:
-            told = f"a way exists ({searches} searches)" if exists else f"no way ({searches} searches)"
-            print(f"{name} {k}: {wrong}; {told}", flush=True)
+            print(f"{name} {k}: {wrong}; {'no way' if lost else 'a way exists'}", flush=True)
     print(
         f"{name}: {good} of {ways} with a way, {count} tasks, {rate(good, ways)} %; of all "
         f"{rate(good, count)} %; {dict(tally)}",

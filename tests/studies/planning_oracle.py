@@ -18,7 +18,7 @@ from tqdm import tqdm
 from projservo_cli.planning.joint_constraints import demands_into
 from projservo_cli.planning.rrt_connect import SearchLimits, find_path, margins_at, with_ends
 from projservo_cli.planning.time_parameterization import minimum_time
-from tests.studies.common import asked_for, quantiles, task_configs, true_search, write_rows
+from tests.studies.common import asked_for, quantiles, search_of, task_configs, write_rows
 
 SEEDS = 5
 # That OMPL searches, and then shortens, at most, s.
@@ -99,7 +99,7 @@ def slowest_joint(way, speed, acceleration):
 
 def compared(config):
     """A way of a task, in numbers, against what other programs make of it."""
-    c, aim, q_start, q_goal = true_search(config, margins=True)
+    c, aim, (q_start, q_goal) = search_of(config, margins=True)
     acceleration = c.limits.acceleration
     seed = config.seed
     how = SearchLimits(config.trajectory.search.max_samples, seed, config.trajectory.max_goal_configurations)

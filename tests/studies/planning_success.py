@@ -17,7 +17,15 @@ from projservo_cli.records import WorkFailed
 from projservo_cli.store.sweep_table import SweepTable
 from projservo_cli.sweeps.folder import Folder, run_of
 from tests.configured import plan, servo, truth_of
-from tests.studies.common import has_no_way, in_two_processes, parser_of, quantiles, rate, write_rows
+from tests.studies.common import (
+    has_no_way,
+    in_two_processes,
+    parser_of,
+    quantiles,
+    rate,
+    search_of,
+    write_rows,
+)
 
 GUIDED, ALONE = "exact_track", "exact"
 KEPT = ("run", "noise_px", "law", "draw", "task", "seed", "verdict", "success", "usable", "steps")
@@ -39,7 +47,7 @@ def rows_of(folder):
 def why(row):
     """Of a guided run that failed: whether there is no way, the plan that it followed, and how it ended."""
     config, calibrated = run_of(f"{row['folder']}:{row['run']}")
-    told = {"no_way": has_no_way(config), "cause": row["verdict"]}
+    told = {"no_way": has_no_way(*search_of(config)), "cause": row["verdict"]}
     if calibrated is None:
         return told
     calibration = calibrated.records["calibration"]
