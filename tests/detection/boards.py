@@ -29,16 +29,16 @@ def picture(board):
     return grey.astype(np.uint8), CELL * (board.grid_points + 2) - 0.5
 
 
-def drawn(board, H, blur, noise, rng, size=SIZE, factor=FACTOR):
+def drawn(board, H, blur, noise, rng, size=SIZE):
     """Image of a board, of which a homography takes squares from its middle to pixels, and its corners."""
     grey, corners = picture(board)
     middle = board.grid_points.mean(axis=0)
     places = np.diag([1.0 / CELL, 1.0 / CELL, 1.0])
     places[:2, 2] = board.grid_points[0] - middle - corners[0] / CELL
-    fine = np.array([[factor, 0.0, (factor - 1) / 2], [0.0, factor, (factor - 1) / 2], [0.0, 0.0, 1.0]])
-    large = (size[0] * factor, size[1] * factor)
+    fine = np.array([[FACTOR, 0.0, (FACTOR - 1) / 2], [0.0, FACTOR, (FACTOR - 1) / 2], [0.0, 0.0, 1.0]])
+    large = (size[0] * FACTOR, size[1] * FACTOR)
     image = cv2.warpPerspective(grey, fine @ H @ places, large, borderValue=200)
-    image = image.reshape(size[1], factor, size[0], factor).mean(axis=(1, 3))
+    image = image.reshape(size[1], FACTOR, size[0], FACTOR).mean(axis=(1, 3))
     image = cv2.GaussianBlur(image, (0, 0), blur) if blur else image
     image = 20 + 0.8 * image + noise * rng.standard_normal(image.shape)
     true = np.c_[board.grid_points - middle, np.ones(len(corners))] @ H.T
