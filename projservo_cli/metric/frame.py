@@ -25,13 +25,13 @@ from typing import NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
 from projservo_cli.calibration.prediction import pixels_of, projection_derivative
 from projservo_cli.geometry.displacements import (
     carried_screws,
     homogeneous,
     rigid_inverse,
+    rotation_vectors,
     screw_displacements,
     screws,
     twists,
@@ -928,6 +928,5 @@ def _covariances(changes: FloatArray) -> FloatArray:
 
 def _pose_difference(T: FloatArray, T0: FloatArray) -> FloatArray:
     """Rotation vectors and shifts (…, 6) from poses T0 to T (…, 4, 4), in the outer frame."""
-    R = T[..., :3, :3] @ T0[..., :3, :3].swapaxes(-1, -2)
-    turn = Rotation.from_matrix(R.reshape(-1, 3, 3)).as_rotvec().reshape(*R.shape[:-2], 3)
+    turn = rotation_vectors(T[..., :3, :3] @ T0[..., :3, :3].swapaxes(-1, -2))
     return np.concatenate([turn, T[..., :3, 3] - T0[..., :3, 3]], axis=-1)

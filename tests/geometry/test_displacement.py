@@ -17,6 +17,7 @@ from projservo_cli.geometry.displacements import (
     normalize_displacement,
     rigid_inverse,
     rotation_and_inverse,
+    rotation_vectors,
     screw_displacements,
     screws,
     tangent_operator,
@@ -54,6 +55,14 @@ def test_cross_matrices_are_those_of_numpy_in_its_memory_layout(rng):
     W = cross_matrix(w)
     np.testing.assert_array_equal(W, np.cross(w[..., None, :], np.eye(3)).swapaxes(-1, -2))
     assert W.swapaxes(-1, -2).flags.c_contiguous  # products of matrices sum in the order of their layout
+
+
+def test_rotation_vectors_are_those_of_scipy_from_none_to_a_half_turn(rng):
+    axes, angles = rng.standard_normal((40, 3)), np.tile([0.0, 1e-9, 0.3, 3.1, np.pi - 1e-6], 8)
+    R = Rotation.from_rotvec(angles[:, None] * axes / np.linalg.norm(axes, axis=1, keepdims=True))
+    np.testing.assert_allclose(rotation_vectors(R.as_matrix()), R.as_rotvec(), atol=1e-11)
+    flipped = np.array([np.diag(signs) for signs in ([1.0, -1.0, -1.0], [-1.0, 1.0, -1.0])])
+    np.testing.assert_allclose(np.abs(rotation_vectors(flipped)), np.pi * np.eye(3)[:2], atol=1e-15)
 
 
 def test_exponentials_of_screws_are_rigid_and_those_of_scipy(rng):

@@ -15,7 +15,14 @@ from projservo_cli.calibration.bundle_adjustment import LeastSquares
 from projservo_cli.calibration.detections import Detections, cauchy_weights, per_block, robust_deviation
 from projservo_cli.calibration.initial.epipolar import ImageFrame, ImageGeometry, log_distances, marker_pairs
 from projservo_cli.calibration.prediction import Parameters
-from projservo_cli.geometry.displacements import aligned, cross_matrix, displacements, homogeneous
+from projservo_cli.geometry.displacements import (
+    aligned,
+    cross_matrix,
+    displacements,
+    homogeneous,
+    nearest_rotations,
+    rotation_vectors,
+)
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
 from projservo_cli.geometry.least_squares import Equations, levenberg_marquardt
 from projservo_cli.records import (
@@ -235,11 +242,6 @@ def _rotations(vectors: FloatArray) -> FloatArray:
     return np.asarray(Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape(*vectors.shape, 3))
 
 
-def _rotation_vectors(R: FloatArray) -> FloatArray:
-    """Rotation vectors (…, 3) of rotations (…, 3, 3), rad."""
-    return np.asarray(Rotation.from_matrix(R.reshape(-1, 3, 3)).as_rotvec().reshape(R.shape[:-1]))
-
-
 def _chain(w: FloatArray, q: FloatArray, prismatic: BoolArray) -> FloatArray:
     """Rotation parts of the truncated products of [RH00] eq. (6): (…, n + 1, K, 3, 3), first the identity.
 
@@ -260,7 +262,7 @@ def _fit_axes(
     """Axes (S, n, 3) and losses (S,) near given ones: Cauchy loss on log(R R_predᵀ), all starts at once."""
     S, n = w.shape[:2]
     away = np.swapaxes(_chain(w, q, prismatic)[:, n], -1, -2) @ R
-    base = np.stack([Rotation.from_matrix(rotations).mean().as_matrix() for rotations in away])
+    base = nearest_rotations(away.sum(axis=1))
 
     def equations(w: FloatArray, base: FloatArray) -> Equations:
         residual, J = _axis_residuals(w, base, R, q, prismatic)
@@ -287,7 +289,7 @@ def _axis_residuals(
     """
     S, n = w.shape[:2]
     chain = _chain(w, q, prismatic)
-    residual = _rotation_vectors(R @ np.swapaxes(chain[:, n] @ base[:, None], -1, -2))
+    residual = rotation_vectors(R @ np.swapaxes(chain[:, n] @ base[:, None], -1, -2))
     J = np.empty((S, len(R), 3, n + 1, 3))
     for i in range(n):
         J[..., i, :] = chain[:, i + 1] - chain[:, i]
@@ -430,13 +432,12 @@ def _turn_of_base(D: FloatArray, alignment: _Alignment) -> FloatArray:
     """
     known = np.flatnonzero(alignment.merged)
     a, b = (known[at] for at in np.triu_indices(len(known), 1))
-    flange, body = (_rotation_vectors(R[a] @ R[b].swapaxes(1, 2)) for R in (D, alignment.R))
+    flange, body = (rotation_vectors(R[a] @ R[b].swapaxes(1, 2)) for R in (D, alignment.R))
     used = np.linalg.norm(flange, axis=1) < _HALF_TURN
     flange, body, weight = flange[used], body[used], np.ones(np.count_nonzero(used))
     C = np.eye(3)
     for _ in range(_ROUNDS):
-        U, _, Vt = np.linalg.svd(body.T @ (weight[:, None] * flange))
-        C = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
+        C = nearest_rotations(body.T @ (weight[:, None] * flange))
         off = np.linalg.norm(body - flange @ C.T, axis=1)
         weight = cauchy_weights((off / (2.0 * robust_deviation(off, _WIDTH))) ** 2)
     return np.asarray(C)
