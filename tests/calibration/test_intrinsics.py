@@ -59,7 +59,7 @@ def test_a_lens_is_that_of_opencv_where_its_terms_are_radial(tmp_path, seed):
     assert found.size == flange.SIZE
 
 
-def recording(folder, rng, name, count=25):
+def recording(folder, rng, name, count):
     """A list of detections by a bent lens, and poses."""
     T = flange.poses(rng, count)
     straight = flange.images(T, WORLD, rng, 0.0)[:, 0]
@@ -79,7 +79,7 @@ def test_a_known_lens_is_taken_and_another_camera_is_named(projservo, monkeypatc
     """New images are predicted within the noise; a focal length that is 3 % off is told by the images."""
     monkeypatch.chdir(tmp_path)
     rng = np.random.default_rng(1)
-    train, test = recording(tmp_path, rng, "train"), recording(tmp_path, rng, "test", 10)
+    train, test = recording(tmp_path, rng, "train", 14), recording(tmp_path, rng, "test", 10)
     by_opencv("mine.yaml")
     by_opencv("other.yaml", flange.K * [[0.97], [0.97], [1.0]])
     found = projservo("calibrate", *train, "--intrinsics", "mine.yaml", "-o", "run", "--json")
@@ -117,7 +117,7 @@ def by_joints(known=None):
 
 def by_parallel_axes(known=None):
     """A calibration by parallel axes and a board of known shape."""
-    types, seen = board_arms.recording("scara", np.random.default_rng(4), sigma_px=0.3)
+    types, seen = board_arms.recording("scara", np.random.default_rng(4), count=16)
     return calibrate(seen, types, boards=(board_arms.BOARD,), source="recorded", cameras=cameras(known))
 
 

@@ -84,7 +84,7 @@ def test_without_the_lens_the_fit_says_what_would_explain_it(robot, poses):
 
 
 def test_a_fit_that_a_lens_spoils_is_refused_with_the_remedy(robot, poses):
-    strong = observed(robot, poses[:25], LENS * [1.0, 1.0, 1.0, 3.0, 3.0])
+    strong = observed(robot, poses[:15], LENS * [1.0, 1.0, 1.0, 3.0, 3.0])
     with pytest.raises(WorkFailed, match="try --lens"):
         calibrated(robot, strong)
 
