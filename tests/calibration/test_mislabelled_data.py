@@ -27,13 +27,13 @@ def refused(observation, types=TYPES):
 
 
 def test_joints_in_the_place_of_each_other_are_named():
-    robot, q, rng = recorded(1)
+    robot, q, rng = recorded(1, count=12)
     one = refused(dataclasses.replace(robot.observe(q, SIGMA, rng), q=q[:, [1, 0, 2]]))
     assert (one.code, one.subject.joints) == ("exchanged_joints", (1, 2))
 
 
 def test_a_joint_that_keeps_the_direction_of_its_link_is_a_parallelogram():
-    robot, q, rng = recorded(2)
+    robot, q, rng = recorded(2, count=12)
     linked = q.copy()
     linked[:, 2] -= q[:, 1] - robot.q_reference[1]
     given = dataclasses.replace(robot.observe(linked, SIGMA, rng), q=q)
@@ -46,7 +46,7 @@ def test_a_joint_that_keeps_the_direction_of_its_link_is_a_parallelogram():
 
 
 def test_a_joint_in_degrees_is_named():
-    robot, q, rng = recorded(3, "RR")
+    robot, q, rng = recorded(3, "RR", count=12)
     given = q.copy()
     given[:, 1] = np.degrees(q[:, 1])
     one = refused(dataclasses.replace(robot.observe(q, SIGMA, rng), q=given), "RR")

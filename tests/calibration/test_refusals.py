@@ -188,12 +188,12 @@ def test_what_no_single_joint_explains_names_none():
 
 
 def test_readings_in_degrees_and_views_exchanged_now_and_then_are_told():
-    observation = seen(random_robot("RR", np.random.default_rng(1), markers=6))
-    assert "units" in refusal(changed(observation, q=np.degrees(observation.q)), "RR")
-    observation = seen(random_robot("RP", np.random.default_rng(2), markers=6))
+    observation = seen(random_robot("R", np.random.default_rng(1), markers=6))
+    assert "units" in refusal(changed(observation, q=np.degrees(observation.q)), "R")
+    observation = seen(random_robot("R", np.random.default_rng(2), markers=6))
     images = observation.images.copy()
     images[::2] = images[::2, ::-1]
-    message = refusal(changed(observation, images=images), "RP")
+    message = refusal(changed(observation, images=images), "R")
     assert "does not describe the data" in message or "correspondences" in message
 
 
