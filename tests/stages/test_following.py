@@ -269,6 +269,20 @@ def test_laws_and_tasks_that_cannot_follow_are_refused():
         moving(None, path=[[0.0] * 7, [0.0] * 7])
 
 
+def test_five_joints_follow_what_a_goal_leaves_open_by_the_law_of_incidences_alone():
+    """Its other poses an arm of five joints cannot take along, so that it went a wrong way."""
+    X = np.array([0.2, 0.0, 0.2]) + 0.03 * np.random.default_rng(1).standard_normal((6, 3))
+    part = {"markers": [*range(40, 46)], "positions_m": X.tolist(), "follow": True, "velocity": BELT}
+    features = {"tip": {"on": "tool", "point": [0]}, "spot": {"on": "part", "point": "tip"}}
+    config = configured(
+        "hobby",
+        *(f"objects.part={json.dumps(part)}", f"features={json.dumps(features)}"),
+        *("task.goal.incidences=[[tip, spot]]", "control.mode=[regulate]"),
+    )
+    with pytest.raises(InputError, match="5 joints are too few: incidences leaves open"):
+        driven(config, calibration=calibrate.run(config)[1])
+
+
 def test_an_object_moves_as_it_is_told():
     """Along its velocity, about its middle, and along rows, before and after which it rests."""
     (one,) = objects_of(moving({"translation_mm_s": [10.0, 0.0, 0.0], "rotation_deg_s": [0.0, 0.0, 30.0]}))

@@ -7,7 +7,7 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from projservo_cli.laws import BODY_LAWS
+from projservo_cli.laws import BODY_LAWS, INCIDENCES
 from projservo_cli.loop.goal_monitor import FollowLimits, GoalMonitor
 from projservo_cli.records import MM, FloatArray, GoalHistory, InputError, Plan
 from projservo_cli.robots.latency_compensation import Tracked
@@ -19,6 +19,7 @@ from projservo_cli.task.objects.object_tracker import ObjectTracker
 from projservo_cli.task.target import TaskImages
 
 _NONE = np.full(3, np.nan)
+_POSE = 6  # joints that a whole pose needs wherever its object takes it
 
 
 class FollowedGoal(NamedTuple):
@@ -58,7 +59,7 @@ def followed_goal(
 
     images : start and goal as the law measures them.
 
-    Raises InputError for a law that does not measure with the calibrated body.
+    Raises InputError for a law that does not measure with the calibrated body, or that needs more joints.
     """
     inputs, displaced = scenario.world.inputs, scenario.world.inputs.displaced
     if session.followed is not None and session.robot is not None and displaced and displaced.of_start:
@@ -82,6 +83,12 @@ def followed_goal(
             f"objects.{carrier.name}.follow: the latency of the cameras is not known, and the object moves "
             "meanwhile: calibrate from images of a moving arm (projservo record), or set plant.time_offset_s"
         )
+    whole = not scenario.exact.goal.incidences
+    if not whole and law != INCIDENCES and len(c.q_reference) < _POSE:
+        raise InputError(
+            f"{law} takes the whole pose of the plan along with objects.{carrier.name}, for which "
+            f"{len(c.q_reference)} joints are too few: {INCIDENCES} leaves open what the goal leaves open"
+        )
     metric = in_metres(c, carrier.lengths)[0]
     tracker = ObjectTracker.of(
         c,
@@ -92,9 +99,6 @@ def followed_goal(
         max_acceleration=asked.max_acceleration,
         name=carrier.name,
     )
-    whole = not scenario.exact.goal.incidences
-    D, taught = tracker.planned.D, taught_goal(scenario)
-    goal = MovingGoal(images(), scenario.world.model, tracker, whole, D, taught)
     max_speed = math.inf if asked.max_speed_mm_s is None else asked.max_speed_mm_s
     limits = FollowLimits(scenario.servo.stop.follow_s, max_speed, asked.lost_s, asked.approach_mm)
     indices = [contract.driven.further.index(number) for number in numbers]
