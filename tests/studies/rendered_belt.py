@@ -17,6 +17,7 @@ of constant velocity, and a law that leads joints by its prediction. It has as l
 import json
 import math
 import os
+import shutil
 from collections import deque
 from dataclasses import replace
 from functools import cache
@@ -279,8 +280,9 @@ def by_commands(k, task, pages):
     code, line = said(["servo", "-c", "pick.yaml", "-o", "run"])
     row |= {"code": code, "reason": line} | gripped(Belt.last)
     row["done"] = row["gripped"] and code == 0 and row["moved_mm"] >= 1e3 * COMES_M
-    if pages:
-        said(["report", "run", "-o", str(pages / f"{k}")])
+    if pages and not code:
+        said(["report", "run"])
+        shutil.copytree("run", pages / f"{k}")
     return row
 
 
