@@ -20,6 +20,8 @@ from scipy.stats import chi2
 
 from projservo_cli.config.inputs import servo_inputs
 from projservo_cli.records import WorkFailed
+from projservo_cli.report.figure_inputs import Driven
+from projservo_cli.report.figures import FIGURES
 from projservo_cli.simulation.arm import camera_center
 from projservo_cli.simulation.random_tasks import random_tasks
 from projservo_cli.stages.scenario import run_scenario
@@ -204,6 +206,14 @@ def drawn(job):
             row["failed"] = str(error)
         rows.append(row)
     return rows
+
+
+def draw_following(path, run, step, law):
+    """Write how a step of a stored run followed its goal, Fig. 23 of a report, as a PNG."""
+    (figure,) = (spec for spec in FIGURES if spec.name == "fig23_following")
+    shown = Driven(run.calibration, None, run.at_step(step).plan, {law: run.traces[f"{step}/{law}"]})
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.drawn(figure.data(shown)).savefig(path)
 
 
 def rms(rows):

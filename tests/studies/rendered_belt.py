@@ -1,6 +1,6 @@
 """A part on a belt before rendered cameras, followed and gripped; and control by positions beside it.
 
-    python -m tests.studies.rendered_belt [--first 0] [--tasks 30] [--pages FOLDER] [-o rendered_belt.csv]
+    python -m tests.studies.rendered_belt [--first 0] [--tasks 30] [--pictures FOLDER] [-o rendered_belt.csv]
 
 The UR5e of rendered_conditions, its images 40 ms late, and a part with two tags of 30 mm on a belt at
 30 mm/s. One recording and calibration by the commands, of a robot class that knows no model. Each task
@@ -17,7 +17,6 @@ of constant velocity, and a law that leads joints by its prediction. It has as l
 import json
 import math
 import os
-import shutil
 from collections import deque
 from dataclasses import replace
 from functools import cache
@@ -40,6 +39,7 @@ from tests.studies import hand_eye
 from tests.studies.carried_goals import seen, tags
 from tests.studies.common import parser_of, quantiles, written
 from tests.studies.displaced_parts import tag_at
+from tests.studies.following import draw_following
 from tests.studies.rendered import known_by_hand_eye
 from tests.studies.rendered_conditions import FRAMES, FRONT, base_of
 from tests.studies.so101_goals import said
@@ -269,7 +269,7 @@ PICK = {
 }
 
 
-def by_commands(k, task, pages):
+def by_commands(k, task, pictures):
     """Row of a task that is taught and driven by the commands."""
     row = {"task": k, "by": "projservo", "gripped": False, "done": False}
     Belt.task, Belt.still, Belt.stream = task, True, 4 * k + 1
@@ -280,9 +280,8 @@ def by_commands(k, task, pages):
     code, line = said(["servo", "-c", "pick.yaml", "-o", "run"])
     row |= {"code": code, "reason": line} | gripped(Belt.last)
     row["done"] = row["gripped"] and code == 0 and row["moved_mm"] >= 1e3 * COMES_M
-    if pages and not code:
-        said(["report", "run"])
-        shutil.copytree("run", pages / f"{k}")
+    if pictures and not code:
+        draw_following(pictures / f"{k}.png", load(Path("run")), "grip", "exact")
     return row
 
 
@@ -405,11 +404,11 @@ def is_near(errors):
     return mm <= NEAR_MM and deg <= NEAR_DEG
 
 
-def rows_of(tasks, known, pages):
+def rows_of(tasks, known, pictures):
     """Rows of each task, by both."""
     for k in tasks:
         task = drawn(k)
-        rows = [by_commands(k, task, pages), by_positions(k, task, known)]
+        rows = [by_commands(k, task, pictures), by_positions(k, task, known)]
         for row in rows:
             print({name: x for name, x in row.items() if name != "reason"}, flush=True)
             if not row["done"]:
@@ -421,9 +420,9 @@ def main():
     """Record, drive all tasks, and print what came of it."""
     counted = [("first", 0, "number of the first task"), ("tasks", TASKS, "number")]
     parser = parser_of("rendered_belt", __doc__, counted)
-    parser.add_argument("--pages", type=Path, help="folder of a report of each run")
+    parser.add_argument("--pictures", type=Path, help="folder of Fig. 23 of each run")
     given = parser.parse_args()
-    output, pages = given.output.resolve(), given.pages and given.pages.resolve()
+    output, pictures = given.output.resolve(), given.pictures and given.pictures.resolve()
     with TemporaryDirectory() as folder:
         os.chdir(folder)
         for name, content in (("arm", FILE), ("pick", FILE | {"task": PICK})):
@@ -431,7 +430,7 @@ def main():
         print(said(["record", "calibrate", "-c", "arm.yaml", "-o", "run"]), flush=True)
         known = known_by_hand_eye(base_of("40 ms late"), load(Path("run")).observation)
         tasks = range(given.first, given.first + given.tasks)
-        rows = written(output, COLUMNS, rows_of(tasks, known, pages))
+        rows = written(output, COLUMNS, rows_of(tasks, known, pictures))
         os.chdir(output.parent)
     for by in ("projservo", "hand-eye"):
         mine = [row for row in rows if row["by"] == by]

@@ -1,6 +1,6 @@
 """A part on a turntable beside an emulated SO-101: how near the arm stays to where it has its goal.
 
-    python -m tests.studies.turntable [TASKS] [--first 0] [--fps 15] [--rate 0.25] [--pages FOLDER]
+    python -m tests.studies.turntable [TASKS] [--first 0] [--fps 15] [--rate 0.25] [--pictures FOLDER]
 
 Bench, recording, mechanics, and the part with two tags of 30 mm are those of ``pick_and_place``: the middle
 of the face and the direction of its upright edge go along with the part, and the turn about that follows, as
@@ -12,7 +12,6 @@ and 2 degrees rms from the first arrival on, by the arm and the part of the emul
 
 import argparse
 import math
-import shutil
 import threading
 from pathlib import Path
 
@@ -24,6 +23,7 @@ from projservo_cli.geometry.displacements import rigid
 from projservo_cli.store.run_file import load
 from tests.studies.carried_goals import seen
 from tests.studies.common import quantiles
+from tests.studies.following import draw_following
 from tests.studies.pick_and_place import (
     APART_PX,
     AWAY,
@@ -162,17 +162,17 @@ def main():
     parser.add_argument("--fps", type=float, default=15.0, help="frames a second of both cameras")
     parser.add_argument("--rate", type=float, default=0.25, help="of the emulated clock while it records")
     parser.add_argument("--slower", type=float, default=0.32, help="factor of the rate while it follows")
-    parser.add_argument("--pages", type=Path, help="folder of a report of each run")
+    parser.add_argument("--pictures", type=Path, help="folder of Fig. 23 of each run")
     given = parser.parse_args()
-    pages = given.pages and given.pages.resolve()
+    pictures = given.pictures and given.pictures.resolve()
     with with_part(given.rate, given.fps) as (bench, truth, _):
         if prepared(bench, "-o", "run"):
             written(bench)
             bench.arm.clock.slow_down(given.slower)  # no period must be late, or the arm is slower
-            _driven(bench, truth, given, pages)
+            _driven(bench, truth, given, pictures)
 
 
-def _driven(bench, truth, given, pages):
+def _driven(bench, truth, given, pictures):
     arm, errors = bench.arm, []
     arm.displacement = np.eye(4)
     if (q := taught(bench, [*TEACH, "grip.yaml"], GRIP)) is None:
@@ -191,9 +191,8 @@ def _driven(bench, truth, given, pages):
             errors.append(np.sqrt(np.mean(rows[:, 1:] ** 2, axis=0)))
             how = f"{errors[-1][0]:.2f} mm, {errors[-1][1]:.2f}° rms over {len(rows)} samples"
         print(f"{k:3} exit {code}: {how}  {line[-300:]}", flush=True)
-        if pages and code == 0:
-            said(["report", "run"])
-            shutil.copytree("run", pages / f"{k}")
+        if pictures and code == 0:
+            draw_following(pictures / f"{k}.png", load(Path("run")), "grip", "incidences")
     found = np.array(errors).reshape(-1, 2)
     near = int(((found[:, 0] <= NEAR_MM) & (found[:, 1] <= NEAR_DEG)).sum())
     print(f"{near} of {given.tasks} within {NEAR_MM:g} mm and {NEAR_DEG:g}° rms; {len(found)} followed")
