@@ -99,6 +99,8 @@ def followed_goal(
         max_acceleration=asked.max_acceleration,
         name=carrier.name,
     )
+    D, taught = tracker.planned.D, taught_goal(scenario)
+    goal = MovingGoal(images(), scenario.world.model, tracker, whole, D, taught)
     max_speed = math.inf if asked.max_speed_mm_s is None else asked.max_speed_mm_s
     limits = FollowLimits(scenario.servo.stop.follow_s, max_speed, asked.lost_s, asked.approach_mm)
     indices = [contract.driven.further.index(number) for number in numbers]
