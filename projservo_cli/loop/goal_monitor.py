@@ -56,6 +56,7 @@ class FollowLimits(NamedTuple):
     max_speed: float  # of its object, mm/s, or px/s if no length is known
     lost_s: float  # for which its motion is predicted, s
     approach_mm: float  # distance of the tool from the goal within which no motion is predicted
+    replans: int = 0  # how often a plan to it may be made again
 
 
 class GoalMonitor:
@@ -74,11 +75,10 @@ class GoalMonitor:
         limits: Limits,
         asked: FollowLimits,
         plan: Callable[[Callable[[float], FloatArray], FloatArray], Task] | None = None,
-        attempts: int = 0,
     ) -> None:
         self._law, self._goal, self._robot, self._limits, self._asked = law, goal, robot, limits, asked
         # Task with a plan from joints (n,) to where the displacement (4, 4) after some time, s, has the goal.
-        self._plan, self._attempts = plan, attempts  # how often it may be made again
+        self._plan = plan
         self._leads_to: FloatArray | None = None  # displacement (4, 4) of the goal of the plan; None before
         self.replannings: list[Finding] = []
         self.covered: Finding | None = None
@@ -191,10 +191,10 @@ class GoalMonitor:
             return True
         if self._leads_to is not None:
             left_s = self._law.arrives_in * self._robot.robot.bounds.period / self._law.gains.scale
-            soon = left_s < _LEARNT_S  # the law goes the rest by itself
-            if soon or not self._attempts or k % _EVERY or not self._elsewhere(left_s):
+            # Near the end, the law goes the rest by itself.
+            may = left_s >= _LEARNT_S and len(self.replannings) < self._asked.replans
+            if not may or k % _EVERY or not self._elsewhere(left_s):
                 return False
-            self._attempts -= 1
             why = Subject(name="goal_elsewhere")
             self.replannings.append(Finding("replanned", NOTE, why, k, unit="1"))
         self._law.follow(self._plan(self._displaced_after, log.read[k]))

@@ -102,7 +102,13 @@ def followed_goal(
     D, taught = tracker.planned.D, taught_goal(scenario)
     goal = MovingGoal(images(), scenario.world.model, tracker, whole, D, taught)
     max_speed = math.inf if asked.max_speed_mm_s is None else asked.max_speed_mm_s
-    limits = FollowLimits(scenario.servo.stop.follow_s, max_speed, asked.lost_s, asked.approach_mm)
+    limits = FollowLimits(
+        seconds=scenario.servo.stop.follow_s,
+        max_speed=max_speed,
+        lost_s=asked.lost_s,
+        approach_mm=asked.approach_mm,
+        replans=scenario.servo.laws.max_replan_attempts,
+    )
     indices = [contract.driven.further.index(number) for number in numbers]
     tracked = Tracked(carried.object_name, indices, tracker)
     return FollowedGoal(goal, limits, tracked, scenario.world.true_motion)

@@ -186,8 +186,7 @@ class LawRun:
                 limits, stall = scenario.termination, None
                 plans = plan is not None and plan.carried and not self.replans  # else a retreat
                 ahead = partial(self._plan_ahead, followed.goal) if plans else None
-                attempts, asked = scenario.servo.laws.max_replan_attempts, followed.limits
-                self.goal = GoalMonitor(controller, followed.goal, driven, limits, asked, ahead, attempts)
+                self.goal = GoalMonitor(controller, followed.goal, driven, limits, followed.limits, ahead)
             self.in_python(controller, driven, stall)
             if followed is not None and self.goal is not None and self.verdict == "followed":
                 go_on = partial(self._go_on, controller, driven, self.goal)
