@@ -248,7 +248,7 @@ def main():
         for motion in given.motions:
             pairs = [k for k in range(given.runs) if {(k, motion), (k, "not followed")} <= done.keys()]
             of, still = ([done[k, name] for k in pairs] for name in (motion, "not followed"))
-            followed = sum(row["verdict"] == "followed" for row in own if row["motion"] == motion)
+            followed = sum(row.get("verdict") == "followed" for row in own if row["motion"] == motion)
             print(
                 f"  {motion}: followed {followed}; {rms(of):.2f} mm rms, {rms(of) / rms(still):.2f} of the "
                 f"still goal's ({rms(still):.2f}); {quantiles([row['mm'] for row in of])} mm; "
