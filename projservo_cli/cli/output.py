@@ -425,12 +425,13 @@ _MOVES = {
 
 def _following(found: dict[str, Any]) -> str:
     """Motion of an object, distance of the tool from its goal, and deviation of that."""
-    parts = [("; the tool stayed within", "rms_mm", "mm rms of its goal")]
-    if found["motion"] in ("belt", "free"):  # else its middle is at rest
-        parts.insert(0, (" at", "speed_mm_s", "mm/s"))
-    parts += [(", and", "rms_deg", "deg"), ("; the goal is known to", "deviation_mm", "mm")]
-    said = [f"{to} {found[key]:.2g} {unit}" for to, key, unit in parts if found[key] is not None]
-    return f"the object {_MOVES[found['motion']]}{''.join(said)}"
+    speed, known = found["speed_mm_s"], found["deviation_mm"]
+    said = f"the object {_MOVES.get(found['motion'], 'moved')}"
+    if speed is not None and found["motion"] in ("belt", "free"):  # else its middle is at rest
+        said += f" at {speed:.2g} mm/s"
+    rms = [f"{found[f'rms_{unit}']:.2g} {unit}" for unit in ("mm", "deg") if found[f"rms_{unit}"] is not None]
+    said += f"; the tool stayed within {' and '.join(rms)} rms of its goal" if rms else ""
+    return said + ("" if known is None else f"; the goal is known to {known:.2g} mm")
 
 
 def _of_report(value: dict[str, Any], detailed: bool) -> Iterator[str]:
