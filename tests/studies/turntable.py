@@ -1,6 +1,7 @@
 """A part on a turntable beside an emulated SO-101: how near the arm stays to where it has its goal.
 
-    python -m tests.studies.turntable [TASKS] [--first 0] [--fps 15] [--rate 0.25] [--pictures FOLDER]
+    python -m tests.studies.turntable [TASKS] [--first 0] [--fps 15] [--rate 0.25] [--slower 0.32]
+                                      [--pictures FOLDER]
 
 Bench, recording, mechanics, and the part with two tags of 30 mm are those of ``pick_and_place``: the middle
 of the face and the direction of its upright edge go along with the part, and the turn about that follows, as

@@ -58,7 +58,7 @@ class TruePoses(NamedTuple):
 
 
 def _in_motion(readings: list[Reading], which: list[int]) -> ObjectView:
-    """Some markers, of which one of several readings shows the most, and which may move.
+    """Some markers of the reading that shows the largest number of them; they may move.
 
     Views are taken at other times, up to a reading apart, so a marker is as uncertain as it moves meanwhile.
     """
