@@ -1314,8 +1314,8 @@ class IncidenceHistory(RecordPart):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class GoalHistory(RecordPart):
-    """A goal that an object carried while a law ran, and how well it was followed from its arrival on."""
+class FollowedErrors(RecordPart):
+    """Errors of a goal that an object carried while a law ran, from its arrival on."""
 
     followed_rms_px: float | None = _optional_scalar(
         "px", "image error to the goal where it was, rms over time"
@@ -1336,8 +1336,15 @@ class GoalHistory(RecordPart):
         "deg", "likewise; none if the joints leave angles open"
     )
     followed_motion: str = _scalar(
-        about="motion of the object in the last frames: still, belt, turntable or free"
+        about="motion of the object in the last frames: still, belt, turntable or free", default=""
     )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class GoalHistory(Composite, RecordPart):
+    """A goal that an object carried while a law ran, over time."""
+
+    followed: FollowedErrors
     goal_time: FloatArray = _array("time", "s", "clock of the robot")
     goal_error_px: FloatArray = _array(
         "time", "px", "image error to the goal where it was; NaN if unmeasured"

@@ -6,7 +6,8 @@ along with the goal: λ (x* + v/λ − x) = λ (x* − x) + v. The law stays as 
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from dataclasses import replace
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -34,10 +35,12 @@ from projservo_cli.loop.verdicts import (
     tolerance,
 )
 from projservo_cli.records import MM, FloatArray, WorkFailed
-from projservo_cli.robots.latency_compensation import DrivenRobot
+from projservo_cli.robots.latency_compensation import DrivenRobot, Tracked
 from projservo_cli.task.face import Task
 from projservo_cli.task.incidences import image_error_at
+from projservo_cli.task.objects.displaced_object import CarriedGoal
 from projservo_cli.task.objects.moving_goal import Followed, MovingGoal
+from projservo_cli.task.target import TaskImages
 
 # Rms of the errors over their stated deviation that counts as followed.
 _WITHIN = 3.0
@@ -59,24 +62,52 @@ class FollowLimits(NamedTuple):
     replans: int = 0  # how often a plan to it may be made again
 
 
+class FollowedGoal(NamedTuple):
+    """A goal to follow."""
+
+    goal: MovingGoal
+    limits: FollowLimits
+    tracked: Tracked
+    # True displacements (k, 4, 4) of the object at times (k,), s, since it was planned first, and its middle.
+    truth: Callable[[FloatArray], tuple[FloatArray, FloatArray]]
+    since: float | None = None  # when a retreat from the object began, s
+
+    def true_motion(self, t: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """True displacements (k, 4, 4) of the goal at times (k,), s, and the middle (4,) of its object, m.
+
+        Since the motion was planned; NaN if unknown.
+        """
+        T, middle = self.truth(t)
+        if self.since is None:
+            return T, middle
+        (T_then,), _ = self.truth(np.array([self.since]))
+        return T @ np.linalg.inv(T_then), T_then @ middle
+
+    def retreat(self, images: TaskImages, t: float) -> Self:
+        """Return the goal of a retreat that begins at a time, s, which goes along with the object."""
+        goal = replace(self.goal, images=images, whole=True, D_planned=self.goal.tracker.at(t).D, taught=None)
+        return self._replace(goal=goal, since=t)
+
+
 class GoalMonitor:
     """The goal of a run that moves: it leads the law, and rules by how well the goal is followed.
 
     ``periods``: the goal over time. ``since``: period from which on it is followed; None before.
     ``here``: start and goal in the last period. ``replannings``: when a plan to it was made again, and why.
     ``covered``: views that did not show the object as the others did, when some did so last.
+    ``true_motion``: as of the goal.
     """
 
     def __init__(
         self,
         law: BuiltInLaw,
-        goal: MovingGoal,
+        followed: FollowedGoal,
         robot: DrivenRobot,
         limits: Limits,
-        asked: FollowLimits,
         plan: Callable[[Callable[[float], FloatArray], FloatArray], Task] | None = None,
     ) -> None:
-        self._law, self._goal, self._robot, self._limits, self._asked = law, goal, robot, limits, asked
+        self._law, self._robot, self._limits = law, robot, limits
+        self._goal, self._asked, self.true_motion = followed.goal, followed.limits, followed.true_motion
         # Task with a plan from joints (n,) to where the displacement (4, 4) after some time, s, has the goal.
         self._plan = plan
         self._leads_to: FloatArray | None = None  # displacement (4, 4) of the goal of the plan; None before
@@ -148,6 +179,16 @@ class GoalMonitor:
         """Periods since the goal was reached last, until it was given up; none before."""
         return [] if self.since is None else self.periods[self.since : self._given_up]
 
+    @property
+    def carried(self) -> CarriedGoal | None:
+        """The goal in the last period, with its errors; None of a retreat, or out of sight."""
+        return self._goal.carried(self.periods[-1].t)
+
+    @property
+    def motion(self) -> str:
+        """Kind of motion of its object, as the last frames show it."""
+        return self._goal.tracker.kind.name
+
     def goes_on(self, limits: Limits) -> None:
         """Lead the law on by other limits, to no other verdict than that the goal is lost."""
         self._limits, self._asked = limits, self._asked._replace(seconds=math.inf)
@@ -189,11 +230,11 @@ class GoalMonitor:
             return False
         if not self._leads:
             return True
-        if self._leads_to is not None:
+        if (planned := self._leads_to) is not None:
             left_s = self._law.arrives_in * self._robot.robot.bounds.period / self._law.gains.scale
             # Near the end, the law goes the rest by itself.
             may = left_s >= _LEARNT_S and len(self.replannings) < self._asked.replans
-            if not may or k % _EVERY or not self._elsewhere(left_s):
+            if not may or k % _EVERY or not self._elsewhere(planned, left_s):
                 return False
             why = Subject(name="goal_elsewhere")
             self.replannings.append(Finding("replanned", NOTE, why, k, unit="1"))
@@ -205,14 +246,13 @@ class GoalMonitor:
         self._leads_to = self._goal.moved(self._goal.tracker.at(self._robot.steered.reading.t_q + seconds))
         return self._leads_to
 
-    def _elsewhere(self, seconds: float) -> bool:
-        """Whether the goal will be elsewhere after a time, s, than the plan has it, beyond chance.
+    def _elsewhere(self, planned: FloatArray, seconds: float) -> bool:
+        """Whether the goal will be elsewhere after a time, s, than the plan has it (4, 4), beyond chance.
 
         A plan keeps the arm in sight and in reach, so the law may go a small share of the path without it.
         """
-        assert self._leads_to is not None
         motion = self._goal.tracker.at(self._robot.steered.reading.t_q + seconds)
-        D, planned = self._goal.moved(motion), self._leads_to
+        D = self._goal.moved(motion)
         off = self._goal.at(D).s_star - self._goal.at(planned).s_star
         sigma = self._goal.sigma_px(motion, D @ self._goal.H)
         far = max(_WITHIN * math.hypot(sigma, self._limits.image_error_px), _FREE * self.periods[-1].error[0])

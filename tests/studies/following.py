@@ -156,8 +156,8 @@ def centre_mm(run, along_with):
 
 def against_truth(run, t):
     """χ² of the goal at a time, s, against where it truly is, by its stated errors; with the goal."""
-    truth, carried = run.scenario.world.truth, run.followed.goal.carried(t)
-    (T,), _ = run.followed.true_motion(np.array([t]))
+    truth, carried = run.scenario.world.truth, run.goal.carried
+    (T,), _ = run.goal.true_motion(np.array([t]))
     H = T @ run.scenario.true_ends.goal_pose @ np.linalg.inv(run.scenario.true_ends.base_tool)
     error, J = carried_pose(truth, carried.s, truth.M @ H.T)
     changes = np.linalg.pinv(J) @ carried.changes.reshape(len(carried.changes), -1).T
@@ -182,7 +182,7 @@ def one_run(config, calibration, *, follow):
     return {
         "square": square,
         "stated_mm": carried.position_mm,
-        "kind": run.followed.goal.tracker.kind.name,
+        "kind": run.goal.motion,
         "verdict": run.verdict,
         "mm": mm,
         "rms_px": px,

@@ -2,14 +2,12 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
-from typing import NamedTuple, Self
 
 import numpy as np
 
 from projservo_cli.laws import BODY_LAWS, INCIDENCES
-from projservo_cli.loop.goal_monitor import FollowLimits, GoalMonitor
-from projservo_cli.records import MM, FloatArray, GoalHistory, InputError, Plan
+from projservo_cli.loop.goal_monitor import FollowedGoal, FollowLimits, GoalMonitor
+from projservo_cli.records import MM, FloatArray, FollowedErrors, GoalHistory, InputError, Plan
 from projservo_cli.robots.latency_compensation import Tracked
 from projservo_cli.robots.session import Session
 from projservo_cli.stages.carried_goals import in_metres, known, observations_of, taught_goal
@@ -20,33 +18,6 @@ from projservo_cli.task.target import TaskImages
 
 _NONE = np.full(3, np.nan)
 _POSE = 6  # joints that a whole pose needs wherever its object takes it
-
-
-class FollowedGoal(NamedTuple):
-    """A goal to follow."""
-
-    goal: MovingGoal
-    limits: FollowLimits
-    tracked: Tracked
-    # True displacements (k, 4, 4) of the object at times (k,), s, since it was planned first, and its middle.
-    truth: Callable[[FloatArray], tuple[FloatArray, FloatArray]]
-    since: float | None = None  # when a retreat from the object began, s
-
-    def true_motion(self, t: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """True displacements (k, 4, 4) of the goal at times (k,), s, and the middle (4,) of its object, m.
-
-        Since the motion was planned; NaN if unknown.
-        """
-        T, middle = self.truth(t)
-        if self.since is None:
-            return T, middle
-        (T_then,), _ = self.truth(np.array([self.since]))
-        return T @ np.linalg.inv(T_then), T_then @ middle
-
-    def retreat(self, images: TaskImages, t: float) -> Self:
-        """Return the goal of a retreat that begins at a time, s, which goes along with the object."""
-        goal = replace(self.goal, images=images, whole=True, D_planned=self.goal.tracker.at(t).D, taught=None)
-        return self._replace(goal=goal, since=t)
 
 
 def followed_goal(
@@ -114,26 +85,16 @@ def followed_goal(
     return FollowedGoal(goal, limits, tracked, scenario.world.true_motion)
 
 
-def history_of(monitor: GoalMonitor, followed: FollowedGoal, goal: FloatArray, times: int) -> GoalHistory:
-    """Return the history of a goal at some times of a run.
-
-    goal : (4,) its true centre when the motion was planned, m.
-    """
-    rows, since = monitor.periods, monitor.followed
-    rows = [*rows, *[rows[-1]._replace(error=(math.nan,) * 3)] * (times - len(rows))]
-    t = np.array([one.t for one in rows])
-    errors = np.array([one.error for one in rows]).reshape(-1, 3)
+def _errors_of(monitor: GoalMonitor) -> FollowedErrors:
+    """Return how well a goal was followed from its arrival on."""
+    since, carried = monitor.followed, monitor.carried
     left = np.array([one.error for one in since]).reshape(-1, 3)
     rms, maximum, speed = _NONE, math.nan, math.nan
     if since:
         rms, maximum = np.sqrt(np.nanmean(left**2, axis=0)), float(np.max(left[np.isfinite(left[:, 0]), 1]))
         speed = float(np.mean([one.speed for one in since])) if math.isfinite(maximum) else math.nan
     px, mm, deg, max_mm, mm_s = map(known, (*rms, maximum, speed))
-    T, middle = followed.true_motion(t)
-    carried, tracker = followed.goal.carried(t[-1]), followed.goal.tracker
-    seconds = np.maximum(np.diff(t, prepend=t[0]), 1e-9)
-    steps = np.linalg.norm(np.diff((T @ middle)[:, :3], axis=0, prepend=np.nan), axis=1)
-    return GoalHistory(
+    return FollowedErrors(
         followed_rms_px=px,
         followed_rms_mm=mm,
         followed_max_mm=max_mm,
@@ -142,7 +103,24 @@ def history_of(monitor: GoalMonitor, followed: FollowedGoal, goal: FloatArray, t
         followed_speed_mm_s=mm_s,
         followed_deviation_mm=known(math.nan if carried is None else carried.position_mm),
         followed_deviation_deg=known(math.nan if carried is None else carried.rotation_deg),
-        followed_motion=tracker.kind.name,
+        followed_motion=monitor.motion,
+    )
+
+
+def history_of(monitor: GoalMonitor, goal: FloatArray, times: int) -> GoalHistory:
+    """Return the history of a goal at some times of a run.
+
+    goal : (4,) its true centre when the motion was planned, m.
+    """
+    rows = monitor.periods
+    rows = [*rows, *[rows[-1]._replace(error=(math.nan,) * 3)] * (times - len(rows))]
+    t = np.array([one.t for one in rows])
+    errors = np.array([one.error for one in rows]).reshape(-1, 3)
+    T, middle = monitor.true_motion(t)
+    seconds = np.maximum(np.diff(t, prepend=t[0]), 1e-9)
+    steps = np.linalg.norm(np.diff((T @ middle)[:, :3], axis=0, prepend=np.nan), axis=1)
+    return GoalHistory(
+        followed=_errors_of(monitor),
         goal_time=t,
         goal_error_px=errors[:, 0],
         goal_error_mm=errors[:, 1],

@@ -48,7 +48,7 @@ from projservo_cli.robots.session import FollowedObject, Session
 from projservo_cli.simulation.analytic_plant import AnalyticPlant, Ends, Plant
 from projservo_cli.stages import plan as planning
 from projservo_cli.stages.plan_motion import PathReplanner, search_of, why_closed
-from projservo_cli.stages.runs.followed_goal import FollowedGoal, followed_goal
+from projservo_cli.stages.runs.followed_goal import followed_goal
 from projservo_cli.stages.runs.plugin_law import LawSetup, PluginLaw
 from projservo_cli.stages.runs.robot_with_monitors import connected_robot
 from projservo_cli.stages.scenario import RunScenario
@@ -99,8 +99,7 @@ class LawRun:
     limited: float = 0.0  # how often visibility limited the translation
     plant: Plant = _NOT_DRIVEN  # that was driven; of an external robot the calibrated model
     replannings: tuple[Finding, ...] = ()
-    followed: FollowedGoal | None = None  # of a goal that moves
-    goal: GoalMonitor | None = None  # likewise
+    goal: GoalMonitor | None = None  # of a goal that moves
     driven: DrivenRobot | None = None  # client of a robot of the contract
     unseen: Finding | None = None  # cameras that showed nothing before the run, though they were compared
     noise_ratio: float = 1.0  # stated noise of pixels at the end over the noise of the run; at least 1
@@ -171,9 +170,9 @@ class LawRun:
         shared, plan = self.brought.session, self.plan if isinstance(self.plan, Plan) else None
         # The matrices of a frame are small: a second thread costs more than it gives.
         with threadpool_limits(limits=1), nullcontext(shared) if shared else Session() as session:
-            followed = self.followed = followed_goal(scenario, self.law, self._images, plan, session)
+            followed = followed_goal(scenario, self.law, self._images, plan, session)
             tracked = None if followed is None else followed.tracked
-            controller = self.controller()
+            controller = self.controller(moving=followed is not None)
             driven = connected_robot(scenario, self.law, session, self.brought.robot, plan, tracked)
             driven.stops = shared is None
             self.unseen = scenario.world.begin(
@@ -186,7 +185,7 @@ class LawRun:
                 limits, stall = scenario.termination, None
                 plans = plan is not None and plan.carried and not self.replans  # else a retreat
                 ahead = partial(self._plan_ahead, followed.goal) if plans else None
-                self.goal = GoalMonitor(controller, followed.goal, driven, limits, followed.limits, ahead)
+                self.goal = GoalMonitor(controller, followed, driven, limits, ahead)
             self.in_python(controller, driven, stall)
             if followed is not None and self.goal is not None and self.verdict == "followed":
                 go_on = partial(self._go_on, controller, driven, self.goal)
@@ -199,20 +198,19 @@ class LawRun:
         Raises WorkFailed if no feasible plan leads there.
         """
         assert isinstance(self.plan, Plan)
-        scenario, plan, seconds = self.scenario, self.plan, self.plan.duration
+        scenario, plan, seconds = self.scenario, self.plan, self.plan.duration or 0.0
         inputs, calibration = replace(scenario.world.inputs, q_current=q), scenario.world.calibration
-        model, (carried,) = self.believed or scenario.believed_by(self.law), plan.carried
+        (carried,) = plan.carried
         for _ in range(_PLANS):
-            assert seconds is not None
             images = goal.at(displaced(seconds / scenario.gains.scale))
             there = replace(carried, s_carried=images.s_star)
             plan = planning.run(inputs, calibration, changed(plan, carried=(there,)))
             if not plan.feasible:
                 raise WorkFailed(f"no plan leads to where the goal will be: {plan.reason}")
-            before, seconds = seconds, plan.duration
-            if seconds is not None and abs(seconds - before) < _ALIKE_S:
+            before, seconds = seconds, plan.duration or 0.0
+            if abs(seconds - before) < _ALIKE_S:
                 break
-        return followed(model, images.task(model), plan, scenario.gains.period, scenario.gains.scale)
+        return self._to(images, plan)
 
     def _go_on(self, law: LoopLaw, driven: DrivenRobot, goal: GoalMonitor, seconds: float) -> None:
         """Follow the goal for a further time, s; raises WorkFailed if that fails."""
@@ -232,7 +230,8 @@ class LawRun:
         scenario, execution = self.scenario, None
         if self.is_guided and isinstance(law, BuiltInLaw) and self.goal is None:
             assert isinstance(self.plan, Plan)
-            follow, searches = partial(self._task, law.law.model), scenario.servo.laws.max_replan_attempts
+            follow = partial(self._to, scenario.images_for(self.law))
+            searches = scenario.servo.laws.max_replan_attempts
             replanner = PathReplanner(scenario, self.plan)
             blind, limits = self.brought.blind or scenario.world.moves_unseen, scenario.termination
             execution = ExecutionMonitor(law, follow, replanner, searches, limits, stall, blind=blind)
@@ -268,11 +267,15 @@ class LawRun:
         if self.goal is not None:
             self.replannings = tuple(self.goal.replannings)
 
-    def _task(self, model: Model, plan: Plan) -> Task:
-        """The task as a built-in law with a model is given it, with the plan that it follows."""
-        scenario = self.scenario
-        task, scale = scenario.images_for(self.law).task(model), scenario.gains.scale
-        return followed(model, task, plan, scenario.gains.period, scale)
+    @property
+    def _model(self) -> Model:
+        """Robot and rig as a built-in law has them."""
+        return self.believed or self.scenario.believed_by(self.law)
+
+    def _to(self, images: TaskImages, plan: Plan) -> Task:
+        """The task to a goal in images as a built-in law is given it, with the plan that it follows."""
+        gains = self.scenario.gains
+        return followed(self._model, images.task(self._model), plan, gains.period, gains.scale)
 
     def _images(self) -> TaskImages:
         """Start and goal as the law measures them, with the whole pose for a law of incidences without any.
@@ -289,29 +292,34 @@ class LawRun:
         # Its incidences are of the scene, so that the scene is where the goal was carried.
         return images.to(images.s_star).asking(whole_pose(images.body.M[: self.scenario.world.m]))
 
-    def _built_in(self) -> BuiltInLaw:
-        """The built-in law with the model that it is given, and the sense of its rotations."""
+    def _built_in(self, *, moving: bool = False) -> BuiltInLaw:
+        """The built-in law with the model that it is given, and the sense of its rotations.
+
+        moving : whether its goal moves, so that a plan to it is made later.
+        """
         scenario, plan = self.scenario, self.plan
-        model = self.believed or scenario.believed_by(self.law)
-        if self.replans or self.followed is not None:
+        model = self._model
+        if self.replans or moving:
             task = self._images().task(model)
         else:
             assert isinstance(plan, Plan)
-            task = self._task(model, plan)
+            task = self._to(scenario.images_for(self.law), plan)
         found = BuiltInLaw(CODES[self.law], model, task, scenario.gains)
         sense = plan.rotation_sense() if isinstance(plan, Plan) else plan
         found.state.driven[:] = in_span(found.state.work.span, model, scenario.ends.q_start, sense)
         return found
 
-    def controller(self) -> LoopLaw:
+    def controller(self, *, moving: bool = False) -> LoopLaw:
         """The law, ready for the Python loop.
+
+        moving : whether its goal moves.
 
         Raises InputError if there is no such law, it needs a model of the robot that the configuration lacks,
         or the plan to follow has no time; WorkFailed if it cannot be made, or the joints cannot follow the
         plan.
         """
         if self.law in CODES:
-            return self._built_in()
+            return self._built_in(moving=moving)
         scenario, gains, ends = self.scenario, self.scenario.gains, self.scenario.ends.by_points()
         assert isinstance(self.plan, Plan)
         face = np.array(scenario.world.calibration.indices_of(scenario.world.numbers[: scenario.world.m]))
@@ -359,9 +367,9 @@ class LawRun:
     def true_ends(self) -> Ends:
         """True poses of the tool, with the nearest goal to where it ended where incidences leave it open."""
         scenario, H = self.scenario, self.log.H[self.steps]
-        if self.goal is None or self.followed is None or not self.goal.periods:
+        if self.goal is None or not self.goal.periods:
             return scenario.world.nearest_ends(scenario.exact, scenario.true_ends, self.plant, H)
-        (T,), _ = self.followed.true_motion(np.array([self.goal.periods[-1].t]))
+        (T,), _ = self.goal.true_motion(np.array([self.goal.periods[-1].t]))
         H = np.linalg.inv(T) @ H
         found = scenario.world.nearest_ends(scenario.exact, scenario.true_ends, self.plant, H)
         return found._replace(goal_pose=T @ found.goal_pose, goal=T @ found.goal)

@@ -212,8 +212,8 @@ def _stated_mm(run: LawRun) -> dict[str, Any]:
         every = np.zeros((len(scenario.world.view), len(calibration.marker)), dtype=np.bool_)
         every[:, calibration.indices_of(numbers)] = used
         found["undetected_position_error_mm"] = run.driven.monitor.undetected_mm(q, every, posture)
-    if run.goal is not None and run.followed is not None:
-        carried = run.followed.goal.carried(run.goal.periods[-1].t)
+    if run.goal is not None:
+        carried = run.goal.carried
         parts.append(0.0 if carried is None else carried.position_mm)
     elif isinstance(run.plan, Plan) and run.plan.carried:
         parts += [one.goal_deviation_mm or 0.0 for one in run.plan.carried]
@@ -224,9 +224,9 @@ def _stated_mm(run: LawRun) -> dict[str, Any]:
 
 def _of_goal(run: LawRun) -> GoalHistory | None:
     """Return the history of a goal that moved; None of one that stayed."""
-    if run.goal is None or run.followed is None or not run.goal.periods:
+    if run.goal is None or not run.goal.periods:
         return None
-    return history_of(run.goal, run.followed, run.scenario.true_ends.goal, run.steps + 1)
+    return history_of(run.goal, run.scenario.true_ends.goal, run.steps + 1)
 
 
 def _left(log: Log, steps: int) -> tuple[float | None, float | None]:
