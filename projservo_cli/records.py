@@ -1335,8 +1335,8 @@ class FollowedErrors(RecordPart):
     followed_deviation_deg: float | None = _optional_scalar(
         "deg", "likewise; none if the joints leave angles open"
     )
-    followed_motion: str = _scalar(
-        about="motion of the object in the last frames: still, belt, turntable or free", default=""
+    followed_motion: str | None = _optional_scalar(
+        about="motion of the object in the last frames: still, belt, turntable or free"
     )
 
 
