@@ -123,9 +123,9 @@ def importing(files: Iterable[Path], module: Path) -> list[Path]:
 
 
 def nearest(tree: Path, module: str) -> list[str]:
-    """Test file of the name of a module; else those of its folder that import it, or of its importers."""
+    """Test file of the name of a module; else those of its part that import it, or of its importers."""
     package = Path(module).with_suffix("")
-    files = sorted((tree / "tests" / package.parent.name).glob("test_*.py"))
+    files = sorted((tree / "tests" / package.parts[1]).glob("test_*.py"))
     files = [path for path in files if path.stem != "test_jit"]
     chosen = [path for path in files if path.stem == f"test_{package.name}"] or importing(files, package)
     users = importing((tree / package.parent).glob("*.py"), package)
