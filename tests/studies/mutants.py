@@ -45,6 +45,8 @@ MODULES = (
     *("calibration/bundle_adjustment", "calibration/initial/triangulation", "calibration/initial/epipolar"),
     "monitoring/innovation_tests",
 )
+# Tests of modules that are tested by what they are for.
+TESTS_OF = {"camera_resection": "test_views"}
 BINARY = ("Add_Sub", "Sub_Add", "Mul_Div", "Div_Mul", "Pow_Mul")
 ORDER = ("Lt_LtE", "LtE_Lt", "Gt_GtE", "GtE_Gt", "Lt_Gt", "Gt_Lt", "LtE_Gt", "GtE_Lt", "Eq_NotEq", "NotEq_Eq")
 OPERATORS = (
@@ -128,8 +130,8 @@ def nearest(tree: Path, module: str) -> list[str]:
     files = sorted((tree / "tests" / package.parts[1]).glob("test_*.py"))
     files = [path for path in files if path.stem != "test_jit"]
     chosen = [path for path in files if path.stem == f"test_{package.name}"] or importing(files, package)
-    users = importing((tree / package.parent).glob("*.py"), package)
-    through = {f"test_{user.stem}" for user in users}
+    users = importing((tree / Path(*package.parts[:2])).rglob("*.py"), package)
+    through = {TESTS_OF.get(user.stem, f"test_{user.stem}") for user in users}
     chosen = chosen or [path for path in files if path.stem in through] or files
     return [str(path.relative_to(tree)) for path in chosen]
 
