@@ -319,6 +319,7 @@ def test_a_refit_is_part_of_its_run_whatever_the_configuration_file_says(projser
         (("out", "--refit", "left", "--data", "t.csv", "-o", "new", "--lens"), "--lens and --refit left: "),
         (("--refit", "left", "--data", "t.csv"), "calibrate RUN --refit NAME --data TABLE -o NEW"),
         (("out", "--data", "t.csv"), "calibrate RUN --refit NAME --data TABLE -o NEW"),
+        (("t.csv",), "t.csv: a table is given as --data t.csv"),
     ],
 )
 def test_a_refit_that_is_not_clear_is_refused_in_a_line(projservo, reported, words, said):
