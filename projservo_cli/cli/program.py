@@ -25,6 +25,11 @@ _DONE, FAILED, _MALFORMED, _INTERRUPTED = 0, 1, 2, 130
 _COMPLETE = "_PROJSERVO_COMPLETE"
 _COMING = threading.Event()  # an interrupt that was lost and is raised again
 _LEFT_OUT = {"--suggest": "5"}  # default number of an option
+_BY_OPTION = {  # what files of an ending are given by
+    ".yaml": "a configuration is given as -c {}",
+    ".yml": "a configuration is given as -c {}",
+    ".csv": "a table is given as --data {}",
+}
 _FORMER = {"detect": {"--joints-csv": "--readings"}}  # former names of options, which work on
 
 
@@ -143,6 +148,9 @@ class _Group(click.Group):
         first, *rest = words
         if first in self.commands and first not in self.stages:
             return [first], rest
+        for word in words:
+            if by := _BY_OPTION.get(os.path.splitext(word)[1].lower()):
+                raise click.UsageError(f"{word}: {by.format(word)}")
         # The report of a sweep, and a calibration of which a camera is fitted again.
         if first in ("report", "calibrate") and len(rest) == 1 and rest[0] not in self.commands:
             return [first], rest

@@ -225,10 +225,10 @@ def _calibrate(stages: Sequence[str], console: Console, **options: Any) -> int:
     and fits the camera NAME, which moved, again. Exit code 1 if the joint readings cannot be
     confirmed: too few poses, and no other camera.
     """
-    if (given := options["run"] is not None) != (options["refit"] is not None):
-        table = f"{options['run']}: a table is given as --data {options['run']}, and " if given else ""
-        again = "a camera is fitted again by projservo calibrate RUN --refit NAME --data TABLE -o NEW"
-        raise click.UsageError(table + again)
+    if (options["run"] is None) != (options["refit"] is None):
+        raise click.UsageError(
+            "a camera is fitted again by projservo calibrate RUN --refit NAME --data TABLE -o NEW"
+        )
     return _make(console, stages, options)
 
 

@@ -94,6 +94,7 @@ RECORDED, TINY = ["calibrate", "--data", "t.csv"], ["calibrate", "-c", "tiny.yam
 USAGE = {
     "unknown command": (["calibrat"], "did you mean calibrate?"),
     "only options": (["--json"], "no command"),
+    "configuration alone": (["servo", "a.yaml"], "a.yaml: a configuration is given as -c a.yaml\n"),
     "law of a stage without laws": (
         ["calibrate", "--law", "stacked"],
         "--law: not used by calibrate; --law is of servo\n",
