@@ -61,8 +61,9 @@ def _draw(data: Data, figure: "style.Figure") -> None:
     first = names[0]
     curves.append((data[f"t_s_{first}"], data[f"stated_px_{first}"], _STATED))
     panels.errors(errors, curves, _LEAST_PX, xlabel="time (s)", ylabel="image error (px)")
-    speeds.plot(data[f"t_s_{first}"], data[f"true_speed_mm_s_{first}"], **_TRUE)
     known = np.isfinite(data[f"true_speed_mm_s_{first}"]).any()
+    if known:
+        speeds.plot(data[f"t_s_{first}"], data[f"true_speed_mm_s_{first}"], **_TRUE)
     for name, line in zip(names, lines, strict=True):
         speeds.plot(data[f"t_s_{name}"], data[f"speed_{name}"], **line)
         image.plot(*data[f"tool_{name}"][:, 0].T, **line)
