@@ -428,10 +428,17 @@ def _following(found: dict[str, Any]) -> str:
     speed, known = found["speed_mm_s"], found["deviation_mm"]
     said = f"the object {_MOVES.get(found['motion'], 'moved')}"
     if speed is not None and found["motion"] in ("belt", "free"):  # else its middle is at rest
-        said += f" at {speed:.2g} mm/s"
-    rms = [f"{found[f'rms_{unit}']:.2g} {unit}" for unit in ("mm", "deg") if found[f"rms_{unit}"] is not None]
-    said += f"; the tool stayed within {' and '.join(rms)} rms of its goal" if rms else ""
-    return said + ("" if known is None else f"; the goal is known to {known:.2g} mm")
+        said += f", at {_digits(speed)} mm/s on average"
+    rms = [(found[f"rms_{unit}"], unit) for unit in ("mm", "deg") if found[f"rms_{unit}"] is not None]
+    if rms:
+        off = " and ".join(f"{_digits(value)} {unit}" for value, unit in rms)
+        said += f"; for {found['seconds']:.2g} s the tool was {off} rms off its goal"
+    return said + ("" if known is None else f"; the goal is known to {_digits(known)} mm")
+
+
+def _digits(value: float) -> str:
+    """Return a number with two digits, and no exponent for large ones."""
+    return f"{value:.2g}" if value < 99.5 else f"{value:.0f}"
 
 
 def _of_report(value: dict[str, Any], detailed: bool) -> Iterator[str]:

@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import AfterValidator, Field, StringConstraints
 
 from projservo_cli.image_size import ImageSize
-from projservo_cli.laws import IMAGE_TRACK, REGULATE
+from projservo_cli.laws import BODY_LAWS, IMAGE_TRACK, REGULATE
 from projservo_cli.records import LIMITS_MISSING, TOOL, WORLD, InputError, in_unit
 from projservo_cli.settings.calibration_and_refits import CalibrationSettings
 from projservo_cli.settings.cameras import Cameras
@@ -235,7 +235,11 @@ def _carried(
 
 @_between
 def _followed(
-    objects: Objects, features: Mapping[str, Feature], task: TaskSettings | None, control: Control
+    objects: Objects,
+    features: Mapping[str, Feature],
+    task: TaskSettings | None,
+    control: Control,
+    stop: Stop,
 ) -> Iterator[Note]:
     """Goals that cannot be followed, and laws that cannot be led to them by one time."""
     followed = {name for name, one in objects.named.items() if one.follow}
@@ -247,10 +251,18 @@ def _followed(
         if IMAGE_TRACK in control.mode:
             what = "planned images are of the goal where it was: a goal is followed by regulate and track"
             yield ("control", "mode"), what
-        gains = {getattr(control, name) for name in ("gain_t", "gain_r", "gain_p", "gain_s", "gain")}
-        if len(gains) > 1:
-            what = "gains differ, and a goal that is followed is led by 1/gain: make all five the same"
-            yield ("control", "gain_t"), what
+        gains = {name: getattr(control, name) for name in ("gain_t", "gain_r", "gain_p", "gain_s", "gain")}
+        if len({*gains.values()}) > 1:
+            unlike = ", ".join(f"{name} {value:g}" for name, value in gains.items())
+            what = f"a goal that is followed is led by 1/gain: make the gains the same, and not {unlike}"
+            yield ("control",), what
+        for i, law in enumerate(control.laws):
+            if law not in BODY_LAWS:
+                what = f"cannot follow a goal on an object that moves: choose among {', '.join(BODY_LAWS)}"
+                yield ("control", "laws", i), f"{law} {what}"
+        if stop.follow_s > (longest := stop.max_steps * control.period_s):
+            what = f"is longer than a run, stop.max_steps × control.period_s: {longest:g} s"
+            yield ("stop", "follow_s"), what
         return
 
 

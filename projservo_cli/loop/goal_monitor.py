@@ -16,6 +16,7 @@ from projservo_cli.findings import NOTE, REFUSES, Finding, Subject, from_text
 from projservo_cli.geometry.kinematics import project
 from projservo_cli.image_size import within_images
 from projservo_cli.loop.goal_ending import Ending
+from projservo_cli.loop.goal_reach import GoalReach, beyond
 from projservo_cli.loop.python_loop import BuiltInLaw
 from projservo_cli.loop.verdicts import (
     CONVERGED,
@@ -116,7 +117,10 @@ class GoalMonitor:
         self.lead_s = 1.0 / (law.gains.gain_t * law.gains.scale)
         self.periods: list[Followed] = []
         self.since: int | None = None
+        self._before: list[Followed] = []  # periods in which it was not followed well enough
         self.reason: Finding | None = None
+        kept = robot.plant.limits if limits.stop_at_joint_limit else None
+        self._reach = GoalReach(self._goal, kept, self.lead_s)
         self._fast = 0
         self._turned: Finding | None = None  # why the law cannot be given the goal
         self._given_up: int | None = None  # period in which it was
@@ -176,18 +180,23 @@ class GoalMonitor:
 
     @property
     def followed(self) -> list[Followed]:
-        """Periods since the goal was reached last, until it was given up; none before."""
-        return [] if self.since is None else self.periods[self.since : self._given_up]
+        """Periods since the goal was reached last, until it was given up or no longer followed."""
+        return self._before if self.since is None else self.periods[self.since : self._given_up]
 
     @property
     def carried(self) -> CarriedGoal | None:
-        """The goal in the last period, with its errors; None of a retreat, or out of sight."""
-        return self._goal.carried(self.periods[-1].t)
+        """The goal in the last period, with its errors; None of a retreat, out of sight, or pushed."""
+        return None if self.pushed else self._goal.carried(self.periods[-1].t)
 
     @property
-    def motion(self) -> str:
-        """Kind of motion of its object, as the last frames show it."""
-        return self._goal.tracker.kind.name
+    def pushed(self) -> bool:
+        """Whether its object was pushed, so that nothing is known of where it goes."""
+        return self._goal.tracker.pushed is not None
+
+    @property
+    def motion(self) -> str | None:
+        """Kind of motion of its object, as the last frames show it; None if it was pushed."""
+        return None if self.pushed else self._goal.tracker.kind.name
 
     def goes_on(self, limits: Limits) -> None:
         """Lead the law on by other limits, to no other verdict than that the goal is lost."""
@@ -207,6 +216,9 @@ class GoalMonitor:
             self.reason = self._at_end(log, k, verdict)
             return OUT_OF_REACH
         if verdict == NO_PROGRESS or k == self._limits.max_steps:
+            if self.since is not None:
+                seconds = self.periods[-1].t - self.periods[self.since].t
+                self.reason = Finding("followed_short", amount=seconds, limit=self._asked.seconds, unit="s")
             return MAX_STEPS
         if verdict == DIVERGED and np.isfinite(q_dot).all():
             verdict = RUNNING  # the goal went away faster
@@ -269,9 +281,7 @@ class GoalMonitor:
 
     def _followed(self, log: Log, k: int) -> int:
         """``FOLLOWED`` once the error stayed within its deviation for long enough."""
-        now = self.periods[-1]
-        within = tolerance(self._limits, float(log.fit[k, 2]), self._robot.noise_ratio)
-        stated = math.hypot(within, now.sigma_px)
+        now, stated = self.periods[-1], self._stated(log, k)
         self.periods[-1] = now._replace(sigma_px=stated)
         if self.since is None:
             arrived = self._leads and now.error[0] <= stated
@@ -283,8 +293,13 @@ class GoalMonitor:
         error, most = self.over_window
         if error <= most:
             return FOLLOWED
-        self.since = None
+        self._before, self.since = window, None
         return RUNNING
+
+    def _stated(self, log: Log, k: int) -> float:
+        """Stated deviation of the image error in this period, px, before it is stored."""
+        within = tolerance(self._limits, float(log.fit[k, 2]), self._robot.noise_ratio)
+        return math.hypot(within, self.periods[-1].sigma_px)
 
     def _cause(self, log: Log, k: int, q_dot: FloatArray) -> int:
         """Return the cause to give the goal up; ``RUNNING`` if there is none."""
@@ -313,13 +328,12 @@ class GoalMonitor:
             view = self._robot.robot.view[int(np.argmax(outside))]
             self.reason = Finding("goal_leaves_view", REFUSES, Subject(views=(view,)), ahead_s, unit="s")
             return OUT_OF_REACH
-        if self.since is None:
-            return RUNNING
-        q = log.read[k] + ahead_s * q_dot
-        beyond = np.maximum(plant.limits.lower - q, q - plant.limits.upper)
-        if self._limits.stop_at_joint_limit and (beyond > 0.0).any():
-            joint = int(np.argmax(beyond))
-            of = Subject(joints=(joint + 1,))
-            self.reason = Finding("goal_leaves_reach", REFUSES, of, ahead_s, unit="s")
-            return OUT_OF_REACH
-        return RUNNING
+        leaves = None
+        if not self._leads or self._law.arrives_in > 0.0:
+            self._reach.pause()
+        else:
+            leaves = self._reach.found(k, log.read[k], self.periods[-1], _WITHIN * self._stated(log, k))
+        if leaves is None and self.since is not None and self._limits.stop_at_joint_limit:
+            leaves = beyond(plant.limits, log.read[k] + ahead_s * q_dot, ahead_s)
+        self.reason = leaves or self.reason
+        return RUNNING if leaves is None else OUT_OF_REACH

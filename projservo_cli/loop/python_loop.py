@@ -233,6 +233,7 @@ class BuiltInLaw:
     def lead_to(self, task: Task) -> None:
         """Take another goal, without a plan."""
         self.law = self.law._replace(task=self._weighed(task)._replace(reference=NO_REFERENCE))
+        self.state.plan.q_ahead[:] = 0.0  # as the plan that ended left it
         self._bound = None
 
     @property

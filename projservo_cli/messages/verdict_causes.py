@@ -104,7 +104,7 @@ VERDICTS = {
         names=("lost_s", "approach_mm"),
     ),
     "out of reach": Verdict(
-        "a goal that moves is about to leave the images or the limits of the joints",
+        "a goal that moves is about to leave the images or the reach of the arm, or goes away faster than it",
         "begin earlier, slow the object down, or turn the cameras and the arm to where it goes",
         names=("follow",),
     ),
@@ -152,10 +152,15 @@ REASONS = {
     ),
     "blind_camera": Row("the {view} camera has shown no marker of the face since step {count}", "check it"),
     "followed": Row("{name} {amount} rms over stop.follow_s is within {limit}"),
+    "followed_short": Row("the goal was followed for {amount} of {limit}", "raise stop.max_steps"),
     "goal_unseen": Row("no camera has shown its object for {amount} ({limit} at most)"),
     "goal_fast": Row("its object moves at {amount} ({limit} at most)"),
     "goal_leaves_view": Row("in {amount} the goal leaves the image of the {view} camera"),
     "goal_leaves_reach": Row("in {amount} the goal takes {joints} beyond its limit"),
+    "goal_beyond_reach": Row("in {amount} the goal is farther than the joints reach"),
+    "goal_recedes": Row(
+        "the goal goes away faster than the arm follows: its image error grew from {limit} to {amount}"
+    ),
     "replanned": Row("replanned at step {count} ({because})"),
     "replanned_in_vain": Row("replanned at step {count} ({because}) in vain"),
     "passed_over": Row("passed over where the face is lost to step {count}"),

@@ -95,6 +95,8 @@ def test_a_plan_is_made_again_where_its_goal_will_be_elsewhere():
     assert trace.replan_attempts >= 1
     assert "the goal will be elsewhere than the plan had it" in trace.reason
     assert np.sqrt(np.mean(distances_mm(run)[-25:] ** 2)) < 0.7
+    arrived = np.flatnonzero(distances_mm(run) < 4.0)[0]
+    assert run.goal.since - arrived < 50  # the motion of the plan ends with it
 
 
 def test_a_goal_that_no_plan_reaches_is_out_of_reach_before_the_arm_moves():
@@ -145,7 +147,25 @@ def test_a_goal_that_leaves_the_image_is_out_of_reach_before():
     run = driven(moving({"translation_mm_s": [0.0, 250.0, 0.0]}, "stop.max_steps=400"))
     trace = trace_of(run)
     assert (trace.verdict, trace.first_outside_image) == ("out of reach", -1), trace.reason
-    assert "the goal leaves the image" in trace.reason or "beyond its limit" in trace.reason
+    assert "the goal leaves the image" in trace.reason or "farther than the joints reach" in trace.reason
+
+
+def test_a_goal_that_leaves_the_reach_is_given_up_before():
+    """The arm is stretched 1 s later: it stays with its goal up to then."""
+    run = driven(moving({"translation_mm_s": [-100.0, 0.0, 0.0]}, "stop.follow_s=8"))
+    trace = trace_of(run)
+    assert (trace.verdict, trace.first_beyond_limit) == ("out of reach", -1)
+    assert trace.reason == "in 1 s the goal is farther than the joints reach"
+    assert trace.followed_max_mm < 2.0
+
+
+def test_a_goal_that_goes_away_faster_than_the_arm_is_given_up():
+    slow = ("control.joint_speed_limit_deg_s=4", "stop.max_steps=400")
+    run = driven(moving(BELT, *slow))
+    trace = trace_of(run)
+    assert trace.verdict == "out of reach"
+    assert "the goal goes away faster than the arm follows: its image error grew from" in trace.reason
+    assert run.steps < 150
 
 
 def test_a_joint_at_its_limit_and_a_face_that_left_an_image_are_named():
@@ -252,16 +272,24 @@ def test_an_arm_leaves_a_part_while_that_moves_on():
 def test_a_pushed_part_ends_the_run():
     rows = [[0.0] * 7, [1.2, 0, 60, 0, 0, 0, 0], [1.24, 0, 90, 0, 0, 0, 0], [9.0, 0, 500, 0, 0, 0, 0]]
     run = driven(moving(None, path=rows))
+    trace = trace_of(run)
     assert run.verdict == "object moved"
-    assert "is" in trace_of(run).reason
+    assert "from where its motion would have taken it" in trace.reason
+    # Of where it is then, nothing is known.
+    unknown = trace.followed_deviation_mm, trace.followed_motion, trace.estimated_position_error_mm
+    assert unknown == (None, None, None)
 
 
 def test_laws_and_tasks_that_cannot_follow_are_refused():
     with pytest.raises(InputError, match=r"stacked cannot follow objects\.part"):
         driven(moving(BELT), "stacked")
+    with pytest.raises(InputError, match=r"control\.laws\.1: stacked cannot follow a goal"):
+        moving(BELT, "control.laws=[exact, stacked]")
+    with pytest.raises(InputError, match=r"stop\.follow_s: is longer than a run"):
+        moving(BELT, "stop.follow_s=100", "stop.max_steps=500")
     with pytest.raises(InputError, match="a goal is followed by regulate and track"):
         moving(BELT, "control.mode=[regulate, image_track]")
-    with pytest.raises(InputError, match="led by 1/gain"):
+    with pytest.raises(InputError, match=r"led by 1/gain.*gain_s 1"):
         moving(BELT, "control.gain_s=1.0")
     with pytest.raises(InputError, match="gives its motion as velocity does"):
         moving(BELT, path=[[0.0] * 7, [1.0] * 7])

@@ -191,10 +191,11 @@ def _credible(run: LawRun) -> bool:
 def _stated_mm(run: LawRun) -> dict[str, Any]:
     """State the final distance of the face from the goal, rms mm: by images, and with undetectable errors.
 
-    Nothing if no length on the face is known, or images disagree with the calibration.
+    Nothing if no length on the face is known, images disagree with the calibration, or the goal was pushed.
     """
     scenario, calibration, m = run.scenario, run.scenario.world.calibration, run.scenario.world.m
-    if scenario.exact.goal.incidences or not _credible(run):  # a pose of incidences is one of many
+    pushed = run.goal is not None and run.goal.pushed
+    if scenario.exact.goal.incidences or pushed or not _credible(run):  # a pose of incidences is one of many
         return {}
     numbers, q = scenario.numbers_of(run.law), run.log.read[run.steps]
     M = calibration.M[calibration.indices_of(numbers)]

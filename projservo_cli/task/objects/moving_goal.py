@@ -7,7 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from projservo_cli.geometry.kinematics import project
+from projservo_cli.geometry.kinematics import forward_kinematics, image_jacobian, joint_operators, project
+from projservo_cli.geometry.least_squares import Equations, levenberg_marquardt
 from projservo_cli.records import FloatArray, Model, WorkFailed
 from projservo_cli.task.objects.displaced_object import CarriedGoal
 from projservo_cli.task.objects.object_bundle_adjustment import ObjectView
@@ -15,6 +16,7 @@ from projservo_cli.task.objects.object_tracker import ObjectMotion, ObjectTracke
 from projservo_cli.task.target import Place, TaskImages
 
 _STEP = 1e-5  # of a difference, in a coordinate of a motion
+_STEPS = 20  # of Newton's method towards joints at a goal, at most
 
 
 class Followed(NamedTuple):
@@ -83,6 +85,22 @@ class MovingGoal:
     def _projected(self, H: FloatArray) -> FloatArray:
         """Pixels (V, b, 2) of the body displaced by H (4, 4)."""
         return np.asarray(project(self.model.P, self.images.body.M @ H.T, self.model.lens))
+
+    def joints(self, q: FloatArray, D: FloatArray) -> tuple[FloatArray, float]:
+        """Joints (n,) near q at the goal displaced by D (4, 4), and the error left there, px rms a marker.
+
+        For a goal that is a whole pose, without lenses.
+        """
+        M, model = self.images.body.M, self.model
+        s = project(model.P, M @ (D @ self.H).T)
+
+        def equations(q: FloatArray) -> Equations:
+            A = M @ forward_kinematics(model, q[0]).T
+            J = image_jacobian(model.P, A, joint_operators(model, q[0]))
+            return Equations.of((project(model.P, A) - s).reshape(1, -1), J.reshape(1, -1, q.shape[1]))
+
+        (found,), there = levenberg_marquardt((q[None],), equations, lambda step, q: (q + step,), _STEPS)
+        return found[0], float(np.sqrt(2.0 * there.cost[0] / s.size))
 
     def sigma_px(self, motion: ObjectMotion, H: FloatArray) -> float:
         """Deviation of the images of the goal at H (4, 4) by the motion, px rms per marker and view."""
