@@ -5,7 +5,7 @@ from. Keys follow from the configuration and the files that it names, so the wor
 anything is done.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -20,7 +20,7 @@ from projservo_cli.config.inputs import (
     report_inputs,
     servo_inputs,
 )
-from projservo_cli.laws import law_and_mode, run_names
+from projservo_cli.laws import BODY_LAWS, law_and_mode, run_names
 from projservo_cli.messages.verdict_causes import meaning
 from projservo_cli.records import InputError
 from projservo_cli.report.figure_inputs import CLAIMS_FILE, PAGE_FILE
@@ -97,6 +97,8 @@ def steps_for(
                 f"task.steps: one law in one mode drives a sequence, and there are {', '.join(sources)}: "
                 "name one, such as --law exact --set control.mode=[track] (control.laws, control.mode)"
             )
+        if "servo" in stages:
+            _require_followers(config, sources)
         own = "servo" in named and not config.plant.simulated
         for step in _needed(inputs, sources, stages, config.steps):
             before = [one for one in steps if one.stage != step.stage or step.part]
@@ -141,6 +143,16 @@ class _Read(NamedTuple):
     hashed: Mapping[str, str] = {}  # the subset in the key
     note: str = ""  # changes that do not outdate the result, in words
     unkeyed: bool = False  # whether the law is of a notebook or a script, whose source is in no module
+
+
+def _require_followers(config: Config, names: Iterable[str]) -> None:
+    """Refuse laws that cannot follow a goal which moves, by the names of their runs."""
+    for law in (law_and_mode(name)[0] for name in names if config.followed):
+        if law not in BODY_LAWS:
+            raise InputError(
+                f"control.laws: {law} cannot follow objects.{config.followed[0]}, as it measures without the "
+                f"body: name some of {', '.join(BODY_LAWS)}, as --law exact, or leave follow out"
+            )
 
 
 def _sources(names: Sequence[str], config: Config, run: Run) -> dict[str, _Read]:

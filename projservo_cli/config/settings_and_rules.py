@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import AfterValidator, Field, StringConstraints
 
 from projservo_cli.image_size import ImageSize
-from projservo_cli.laws import BODY_LAWS, IMAGE_TRACK, REGULATE
+from projservo_cli.laws import IMAGE_TRACK, REGULATE
 from projservo_cli.records import LIMITS_MISSING, TOOL, WORLD, InputError, in_unit
 from projservo_cli.settings.calibration_and_refits import CalibrationSettings
 from projservo_cli.settings.cameras import Cameras
@@ -233,6 +233,15 @@ def _carried(
                 yield ("task", *path, "on"), f"there is no object {carrier}; {known}"
 
 
+def followed_carriers(
+    objects: Objects, features: Mapping[str, Feature], task: TaskSettings | None
+) -> list[tuple[str, ...]]:
+    """Objects that carry each goal of which one is followed."""
+    followed = {name for name, one in objects.named.items() if one.follow}
+    carriers = [carriers_of(goal, features) for goal in ({} if task is None else task.each_goal).values()]
+    return [names for names in carriers if followed & {*names}]
+
+
 @_between
 def _followed(
     objects: Objects,
@@ -242,9 +251,7 @@ def _followed(
     stop: Stop,
 ) -> Iterator[Note]:
     """Goals that cannot be followed, and laws that cannot be led to them by one time."""
-    followed = {name for name, one in objects.named.items() if one.follow}
-    carriers = [carriers_of(goal, features) for goal in ({} if task is None else task.each_goal).values()]
-    for names in (names for names in carriers if followed & {*names}):
+    for names in followed_carriers(objects, features, task):
         if len(names) > 1:
             what = f"a goal that is followed is on one object, and this one on {' and '.join(names)}"
             yield ("task",), what
@@ -256,10 +263,6 @@ def _followed(
             unlike = ", ".join(f"{name} {value:g}" for name, value in gains.items())
             what = f"a goal that is followed is led by 1/gain: make the gains the same, and not {unlike}"
             yield ("control",), what
-        for i, law in enumerate(control.laws):
-            if law not in BODY_LAWS:
-                what = f"cannot follow a goal on an object that moves: choose among {', '.join(BODY_LAWS)}"
-                yield ("control", "laws", i), f"{law} {what}"
         if stop.follow_s > (longest := stop.max_steps * control.period_s):
             what = f"is longer than a run, stop.max_steps × control.period_s: {longest:g} s"
             yield ("stop", "follow_s"), what
@@ -481,6 +484,11 @@ class Settings(Printed, Root):
             "plant": self.plant.use or "simulated",
             "laws": ", ".join(self.control.laws),
         }
+
+    @property
+    def followed(self) -> tuple[str, ...]:
+        """Names of the objects that carry goals which are followed."""
+        return next(iter(followed_carriers(self.objects, self.features, self.task)), ())
 
     @property
     def arm(self) -> RobotSettings | None:

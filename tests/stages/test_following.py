@@ -3,10 +3,12 @@
 import json
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from projservo_cli.chain.outdated import steps_for
 from projservo_cli.config.inputs import objects_of, servo_inputs
 from projservo_cli.loop.verdicts import JOINT_LIMIT, OUT_OF_REACH, OUT_OF_VIEW
 from projservo_cli.messages import text
@@ -16,6 +18,7 @@ from projservo_cli.stages import plan as planning
 from projservo_cli.stages.runs.run_trace import trace_of
 from projservo_cli.stages.scenario import run_scenario
 from projservo_cli.stages.servo import drive
+from projservo_cli.store.run_file import Run
 from projservo_cli.task.objects.object_tracker import ObjectTracker
 from tests.configured import calibrate, plan
 from tests.known import configured
@@ -283,8 +286,10 @@ def test_a_pushed_part_ends_the_run():
 def test_laws_and_tasks_that_cannot_follow_are_refused():
     with pytest.raises(InputError, match=r"stacked cannot follow objects\.part"):
         driven(moving(BELT), "stacked")
-    with pytest.raises(InputError, match=r"control\.laws\.1: stacked cannot follow a goal"):
-        moving(BELT, "control.laws=[exact, stacked]")
+    with pytest.raises(
+        InputError, match=r"control\.laws: stacked cannot follow objects\.part, .* name some of"
+    ):
+        steps_for(moving(BELT), Run(Path("run.h5")), ["servo"], laws=["exact", "stacked"])
     with pytest.raises(InputError, match=r"stop\.follow_s: is longer than a run"):
         moving(BELT, "stop.follow_s=100", "stop.max_steps=500")
     with pytest.raises(InputError, match="a goal is followed by regulate and track"):
