@@ -7,7 +7,17 @@ from typing import Any
 from docs.generate.markdown import anchor, table, text
 
 # The unit that ends a key, the longest ending first; gains are in 1/s whatever they end in.
-UNITS = {"deg_s": "°/s", "m_s": "m/s", "deg": "°", "rad": "rad", "px": "px", "m": "m", "s": "s"}
+UNITS = {
+    "mm_s": "mm/s",
+    "mm": "mm",
+    "deg_s": "°/s",
+    "m_s": "m/s",
+    "deg": "°",
+    "rad": "rad",
+    "px": "px",
+    "m": "m",
+    "s": "s",
+}
 # Whole numbers beyond which a bound is that of the file, not of what is meant.
 EXACT = 2**53
 

@@ -46,6 +46,8 @@ _PHRASES = {
     "finite_number": "must be a finite number",
     "float_type": "must be a number",
     "int_type": "must be a whole number",
+    "bool_type": "must be true or false",
+    "bool_parsing": "must be true or false",
     "string_type": "must be text; put it in quotes",
     "string_unicode": "must be UTF-8 (rename the file or its folder)",
     "model_type": "must be a mapping of keys to values",

@@ -202,7 +202,7 @@ REASONS = {
     "pushed_object": Row(
         "the object {name}, markers {ends}, is {amount} from where its motion would have taken it ({limit} "
         "at most)",
-        "look what pushed it, or raise its max_acceleration",
+        "look what pushed it, raise its max_acceleration, or check the latency of the cameras",
     ),
     "unseen_markers": Row("{dark} of the calibration"),
 }

@@ -339,9 +339,8 @@ def _reason(run: LawRun, joint: int, remaining: tuple[float | None, float | None
         run.own_unit * value
         for value in (float(log.judged[steps]), tolerance(limits, float(log.fit[steps, 2]), run.noise_ratio))
     )
-    own = Finding(
-        verdict.replace(" ", "_"), REFUSES, Subject(name=name, joints=(joint + 1,)), error, unit=unit
-    )
+    of = Subject(name=name, joints=(joint + 1,) if joint >= 0 else ())
+    own = Finding(verdict.replace(" ", "_"), REFUSES, of, error, unit=unit)
     at_step = replace(own, amount=float(steps), unit="1")
     if verdict == "followed" and run.goal is not None:
         errors, stated = run.goal.over_window
@@ -378,9 +377,14 @@ def _reason(run: LawRun, joint: int, remaining: tuple[float | None, float | None
 
 
 def _covered(run: LawRun) -> Iterator[Finding]:
-    """Tell which views of a followed object were left out, as they contradicted the others."""
-    if run.goal is not None and run.goal.covered is not None:
-        yield run.goal.covered
+    """Tell which views of a followed object were left out, as they contradicted the others.
+
+    Nothing of views that the goal leaves, as its object does.
+    """
+    covered = None if run.goal is None else run.goal.covered
+    left = () if run.why is None else run.why.subject.views
+    if covered is not None and not {*covered.subject.views} <= {*left}:
+        yield covered
 
 
 def _grown(run: LawRun, own: Finding, at_step: Finding) -> Finding:
