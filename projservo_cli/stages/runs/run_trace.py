@@ -379,7 +379,7 @@ def _reason(run: LawRun, joint: int, remaining: tuple[float | None, float | None
 def _covered(run: LawRun) -> Iterator[Finding]:
     """Tell which views of a followed object were left out, as they contradicted the others.
 
-    Nothing of views that the goal leaves, as its object does.
+    Views that the goal leaves are none of these: its object leaves them, too.
     """
     covered = None if run.goal is None else run.goal.covered
     left = () if run.why is None else run.why.subject.views
