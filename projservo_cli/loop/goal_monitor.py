@@ -190,7 +190,7 @@ class GoalMonitor:
 
     @property
     def pushed(self) -> bool:
-        """Whether its object was pushed, so that nothing is known of where it goes."""
+        """Whether its object was pushed, so that its motion is unknown."""
         return self._goal.tracker.pushed is not None
 
     @property

@@ -10,7 +10,7 @@ from projservo_cli.task.objects.moving_goal import Followed, MovingGoal
 
 # Time for which the goal is predicted, s, and periods between predictions.
 _AHEAD_S, _EVERY = 1.0, 10
-# Growth of an error over a time, s, at least, and over so many time constants of the law.
+# Growth of an error that counts, and the time of it, s, or in time constants of the law if that is longer.
 _GROWS, _CHASED_S, _CHASED = 1.1, 2.0, 5.0
 
 
