@@ -46,7 +46,7 @@ from projservo_cli.task.target import TaskImages
 # Rms of the errors over their stated deviation that counts as followed.
 _WITHIN = 3.0
 # Time in which the velocity of an object is learnt, s: until then its goal is not led.
-_LEARNT_S = 0.4
+_LEARNT_S = 0.8
 # Consecutive periods in which a limit of an estimate is passed that count as passed.
 _SURE = 5
 # Periods between checks whether the goal will be where a plan leads, and share of the path by which not.

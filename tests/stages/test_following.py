@@ -103,7 +103,7 @@ def test_a_plan_is_made_again_where_its_goal_will_be_elsewhere():
 
 
 def test_a_goal_that_no_plan_reaches_is_out_of_reach_before_the_arm_moves():
-    away = {"translation_mm_s": [0.0, 900.0, 0.0]}
+    away = {"translation_mm_s": [0.0, 300.0, 0.0]}
     run = driven(moving(away, *TRACK, max_acceleration=20000.0, displacement=BEHIND), "exact_track")
     assert run.verdict == "out of reach"
     assert "no plan leads to where the goal will be" in trace_of(run).reason
@@ -184,12 +184,12 @@ def test_a_goal_that_is_hidden_is_predicted_and_then_lost(monkeypatch):
     look = ObjectTracker.observe
 
     def hand_before_one_camera(self, t, s, sigma=None):
-        look(self, t, np.where(t.max() > 1.5, s * [[[np.nan]], [[1.0]]], s), sigma)
+        look(self, t, np.where(t.max() > 2.0, s * [[[np.nan]], [[1.0]]], s), sigma)
 
     for seconds, verdict in ((0.4, "followed"), (9.0, "lost goal")):
 
         def covered(self, t, s, sigma=None, hidden=seconds):
-            look(self, t, np.where(1.5 < t.max() < 1.5 + hidden, np.nan, s), sigma)
+            look(self, t, np.where(2.0 < t.max() < 2.0 + hidden, np.nan, s), sigma)
 
         monkeypatch.setattr(ObjectTracker, "observe", covered)
         run = driven(moving(BELT))
