@@ -17,6 +17,7 @@ from projservo_cli.task.target import Place, TaskImages
 
 _STEP = 1e-5  # of a difference, in a coordinate of a motion
 _STEPS = 20  # of Newton's method towards joints at a goal, at most
+_ENOUGH = 0.01  # fall of the squares, px², that is not worth another step
 
 
 class Followed(NamedTuple):
@@ -99,7 +100,9 @@ class MovingGoal:
             J = image_jacobian(model.P, A, joint_operators(model, q[0]))
             return Equations.of((project(model.P, A) - s).reshape(1, -1), J.reshape(1, -1, q.shape[1]))
 
-        (found,), there = levenberg_marquardt((q[None],), equations, lambda step, q: (q + step,), _STEPS)
+        (found,), there = levenberg_marquardt(
+            (q[None],), equations, lambda step, q: (q + step,), _STEPS, _ENOUGH
+        )
         return found[0], float(np.sqrt(2.0 * there.cost[0] / s.size))
 
     def sigma_px(self, motion: ObjectMotion, H: FloatArray) -> float:
