@@ -21,7 +21,7 @@ from projservo_cli.loop.jit_notice import compilation
 from projservo_cli.messages import failed, sentence_and_remedy
 from projservo_cli.messages.verdict_causes import arrived, meaning
 from projservo_cli.observations import Observations
-from projservo_cli.records import InputError, Plan, WorkFailed
+from projservo_cli.records import InputError, Plan, Trace, WorkFailed
 from projservo_cli.result_hashes import digest
 from projservo_cli.stages.stage_inputs import PlanInputs, Table
 from projservo_cli.store.run_file import SERVO, Run, save
@@ -198,7 +198,7 @@ class Chain:
                 name = step.name.removeprefix(SERVO)
                 self.laws_done += (name,)
                 trace = self.run.traces[name]
-                if meaning(trace.verdict).ends and not step.part:  # nor is it driven by the next law
+                if _ends_all(trace) and not step.part:  # nor is it driven by the next law
                     self._fail(step, trace.reason)
                 elif not arrived(trace.verdict) and step.part:  # nor are the next steps made
                     self._fail(step, f"ended in {trace.verdict}: {trace.reason}")
@@ -335,7 +335,7 @@ class Chain:
         failed = self.failure.step.removeprefix(SERVO)  # is printed last
         for trace in (self.run.traces[law] for law in self.laws_done if law != failed):
             must, converged = must_converge(trace.law, required), arrived(trace.verdict)
-            if meaning(trace.verdict).ends or (converged and not trace.overruns):
+            if _ends_all(trace) or (converged and not trace.overruns):
                 continue
             but = " must converge, but" if must and not converged else ""
             reason = " ".join(trace.reason.split())
@@ -490,3 +490,9 @@ def _bounded(inputs: PlanInputs, run: Run) -> PlanInputs:
         return inputs
     seen = np.ceil(np.nanmax(run.observation.images, axis=(0, 2)) + 0.5).astype(int).tolist()
     return replace(inputs, seen_px=tuple((width, height) for width, height in seen))
+
+
+def _ends_all(trace: Trace) -> bool:
+    """Whether no other law is driven after a run; a part that is followed may be pushed in any of them."""
+    pushed = trace.of_goal is not None and trace.verdict == "object moved"
+    return meaning(trace.verdict).ends and not pushed

@@ -21,6 +21,7 @@ from projservo_cli.stages.servo import drive
 from projservo_cli.store.run_file import Run
 from projservo_cli.task.objects.object_tracker import ObjectTracker
 from tests.configured import calibrate, plan
+from tests.conftest import ROOT
 from tests.known import configured
 
 NEAR = {"translation_m": [-0.02, -0.08, 0.0], "rotation_deg": [4.0, 5.0, 6.0]}
@@ -281,6 +282,15 @@ def test_a_pushed_part_ends_the_run():
     # Of where it is then, nothing is known.
     unknown = trace.followed_deviation_mm, trace.followed_motion, trace.estimated_position_error_mm
     assert unknown == (None, None, None)
+
+
+def test_each_law_is_driven_although_its_part_is_pushed(projservo, tmp_path):
+    rows = [[0.0] * 7, [1.0] + 6 * [0.0], [1.04, 0, 100, 0, 0, 0, 0]]
+    pushed = ("--set", "objects.part.velocity=null", "--set", f"objects.part.path={json.dumps(rows)}")
+    answer = projservo("servo", "-c", ROOT / "configs/belt.yaml", "-o", tmp_path / "run", "--json", *pushed)
+    assert answer.code == 1
+    assert [law["verdict"] for law in answer.json["laws"]] == ["object moved"] * 2
+    assert answer.err.count("must converge, but ended in object moved: the object part") == 2
 
 
 def test_laws_and_tasks_that_cannot_follow_are_refused():
