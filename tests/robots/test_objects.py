@@ -206,7 +206,7 @@ def test_a_part_on_a_belt_is_followed_until_the_gripper_has_it(call, taught):
     closes = sent.index("gripper 0")
     during = sum(one.step for one in sent[closes + 1 : closes + 11])
     before = sum(one.step for one in sent[closes - 10 : closes])
-    assert np.linalg.norm(during - before) < 0.5 * np.linalg.norm(before)  # 0.4 s of the belt, 12 mm
+    np.testing.assert_allclose(during, before, atol=1e-2)  # 0.4 s of the belt, 12 mm
     _, there, after = load(taught / "run").traces.values()
     assert there.of_goal.goal_error_mm[-1] < 2.0
     assert after.of_goal is None
