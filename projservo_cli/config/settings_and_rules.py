@@ -487,7 +487,7 @@ class Settings(Printed, Root):
 
     @property
     def followed(self) -> tuple[str, ...]:
-        """Names of the objects that carry goals which are followed."""
+        """Names of the objects that carry the first goal which is followed; none without one."""
         return next(iter(followed_carriers(self.objects, self.features, self.task)), ())
 
     @property

@@ -35,7 +35,9 @@ class GoalReach:
         while len(self._led) > 1 and now.t - self._led[1].t >= self._chased_s:
             self._led.popleft()
         recedes = self._recedes(now, within)
-        return self._leaves(q, now, within) if not recedes and k % _EVERY == 0 else recedes
+        # What incidences leave open may lead elsewhere than the whole pose.
+        asks = recedes is None and self._goal.whole and k % _EVERY == 0
+        return self._leaves(q, now, within) if asks else recedes
 
     def pause(self) -> None:
         """Forget errors up to now: a plan may go a long way round."""

@@ -1,15 +1,18 @@
 """Goals on objects that move: led, judged where they are, given up in words, and handed over to the tool."""
 
 import json
+import math
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from projservo_cli.chain.outdated import steps_for
 from projservo_cli.config.inputs import objects_of, servo_inputs
+from projservo_cli.loop.goal_reach import GoalReach
 from projservo_cli.loop.verdicts import JOINT_LIMIT, OUT_OF_REACH, OUT_OF_VIEW
 from projservo_cli.messages import text
 from projservo_cli.records import InputError
@@ -19,6 +22,7 @@ from projservo_cli.stages.runs.run_trace import trace_of
 from projservo_cli.stages.scenario import run_scenario
 from projservo_cli.stages.servo import drive
 from projservo_cli.store.run_file import Run
+from projservo_cli.task.objects.moving_goal import Followed
 from projservo_cli.task.objects.object_tracker import ObjectTracker
 from tests.configured import calibrate, plan
 from tests.conftest import ROOT
@@ -161,6 +165,13 @@ def test_a_goal_that_leaves_the_reach_is_given_up_before():
     assert (trace.verdict, trace.first_beyond_limit) == ("out of reach", -1)
     assert trace.reason == "in 1 s the goal is farther than the joints reach"
     assert trace.followed_max_mm < 2.0
+
+
+def test_a_goal_of_incidences_may_be_reached_otherwise_than_as_it_was_taught():
+    """Joints that show its pose are asked of a whole pose alone."""
+    goal = SimpleNamespace(whole=False)  # has no joints
+    now = Followed(0.0, np.eye(4), np.zeros((2, 4, 2)), (9.0, math.nan, math.nan), 0.1, 0.0, 0.0)
+    assert GoalReach(goal, None, 0.4).found(0, np.zeros(6), now, 1.0) is None
 
 
 def test_a_goal_that_goes_away_faster_than_the_arm_is_given_up():
