@@ -342,7 +342,9 @@ def _contract(config: Config, plan: PlanInputs, files: Files | None) -> Contract
     offset_s = _NO_LATENCY if ideal and plant.time_offset_s is None else plant.time_offset_s
     table = config.data.table if config.data is not None and plan.described.truth is None else ""
     identity = identity_in(table) if table and Path(table).is_file() else ""
-    return Contract(driven, config.disturbance.part(Events), plant.timeout_s, offset_s, settle_s, identity)
+    return Contract(
+        driven, config.disturbance.part(Events), plant.timeout_s, offset_s, settle_s, identity, ideal
+    )
 
 
 def report_inputs(config: Config, files: Files | None = None) -> ReportInputs:

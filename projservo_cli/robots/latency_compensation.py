@@ -21,7 +21,7 @@ from projservo_cli.monitoring.innovation_tests import WINDOW
 from projservo_cli.records import BoolArray, FloatArray, IntArray, WorkFailed
 from projservo_cli.robots.contract import Reading
 from projservo_cli.robots.frame_recorder import FrameRecorder
-from projservo_cli.robots.latency_estimation import DelayPrior, Delays, squares_by_joints
+from projservo_cli.robots.latency_estimation import DelayPrior, Delays, Frames, squares_by_joints
 from projservo_cli.robots.object_watch import ObjectWatch
 from projservo_cli.robots.pacing import Steered
 from projservo_cli.simulation.analytic_plant import Plant, observe
@@ -172,7 +172,7 @@ class DrivenRobot:
             self.noise_ratio = self._noise_of(reading.sigma_px[:, visible], reading.s[:, visible])
         frames = self._instants.update(reading.t_view, images, history)
         q_then = history.at(frames.t)
-        self._track(frames.t, frames.fresh)
+        self._track(frames)
         if self.monitor is not None:
             q_dot = np.stack([history.speed_at(float(t)) for t in frames.t])
             self.monitor.unanswered = self.steered.set_point.unanswered
@@ -192,16 +192,16 @@ class DrivenRobot:
         self.delays.append(self._instants.mean)
         return np.ascontiguousarray(reading.s[:, visible]) + self._carried
 
-    def _track(self, t: FloatArray, fresh: BoolArray) -> None:
-        """Show the object that moves in new frames (V,), taken at times t (V,), s, to its tracker."""
-        if self.tracked is None or not fresh.any():
+    def _track(self, frames: Frames) -> None:
+        """Show the object that moves in new frames to its tracker."""
+        if self.tracked is None or not frames.fresh.any():
             return
         reading, (_, indices, tracker) = self.steered.reading, self.tracked
-        s = np.where(fresh[:, None, None], reading.s_objects[:, indices], np.nan)
+        s = np.where(frames.fresh[:, None, None], reading.s_objects[:, indices], np.nan)
         sigma = np.full(s.shape[:2], max(self.known.sigma_px, MIN_SIGMA))
         if reading.sigma_objects is not None:
             sigma = reading.sigma_objects[:, indices]
-        tracker.observe(t, s, sigma)
+        tracker.observe(frames.t, s, sigma, late=frames.lasting)
         if tracker.pushed is not None and not self.disturbance:
             self.disturbance = tracker.pushed
             self._retreat()

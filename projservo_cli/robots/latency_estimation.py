@@ -88,13 +88,18 @@ class DelayPrior(NamedTuple):
         return cls(np.zeros(views), np.full(views, _UNKNOWN_S), np.full(views, _JITTER_S))
 
     @classmethod
-    def of(cls, calibration: Calibration, given: Sequence[float | None] | None) -> "DelayPrior":
+    def of(
+        cls, calibration: Calibration, given: Sequence[float | None] | None, *, even: bool = False
+    ) -> "DelayPrior":
         """Return the prior of a calibration: given delays of all views, s, calibrated ones, or wide.
 
+        even : whether single frames are known to have no other delay.
         Raises InputError if a view has none among given ones.
         """
         view = calibration.view
         known = cls.unknown(len(view))
+        if even:
+            known = known._replace(jitter=np.full(len(view), _LEAST_JITTER_S))
         if (found := calibration.time_offset) is not None:
             sigma = np.maximum(
                 np.ptp(found.time_offset_interval_s, axis=1) / _INTERVAL, 0.5 * _LEAST_JITTER_S
@@ -110,12 +115,13 @@ class DelayPrior(NamedTuple):
         return known._replace(mean=np.array(given, float), sigma=np.zeros(len(view)))
 
 
-class _Frames(NamedTuple):
+class Frames(NamedTuple):
     """Instants of the images of an observation."""
 
     t: FloatArray  # (V,) s, by the clock of the readings
     sigma: FloatArray  # (V,) s, how well that was known before the images were looked at
     fresh: BoolArray  # (V,) whether the image is another one than before
+    lasting: FloatArray  # (V,) s, deviation of the instants that frames share
 
 
 def squares_by_joints(
@@ -153,7 +159,7 @@ class Delays:
         """Delays (V,) as followed, s: of images from their readings, or from their stamps."""
         return np.array([view.mean for view in self._views])
 
-    def update(self, t_view: FloatArray, images: FloatArray, history: History) -> _Frames:
+    def update(self, t_view: FloatArray, images: FloatArray, history: History) -> Frames:
         """Instants of the images of an observation.
 
         t_view : (V,) s, stamps, NaN if there are none; images : (V, m, 2) px, NaN where unseen.
@@ -166,7 +172,8 @@ class Delays:
             view.update(float(t), s, history) for view, t, s in zip(self._views, t_view, images, strict=True)
         ]
         t, sigma, fresh = zip(*found, strict=True)
-        return _Frames(np.array(t), np.array(sigma), np.array(fresh))
+        lasting = np.array([view.lasting for view in self._views])
+        return Frames(np.array(t), np.array(sigma), np.array(fresh), lasting)
 
     def _reckon_with_joints(self, q: FloatArray) -> None:
         """Add the effect of errors of the readings at joints (n,) to the error of the model.
@@ -203,6 +210,7 @@ class _View:
         self.error_px, self._timeout_s = error_px, timeout_s
         mean, sigma, jitter = (float(both[view]) for both in prior)
         self.mean, self._variance, self._jitter, self._follows = mean, sigma**2, jitter, sigma > 0.0
+        self.lasting = sigma  # deviation of the instants that frames share, s
         blur = np.exp(-0.5 * (np.subtract.outer(_DELAYS, _DELAYS) / jitter) ** 2)
         self._blur = blur / blur.sum(axis=1, keepdims=True)
         self._log_chance = self._open(mean, sigma)
@@ -297,13 +305,14 @@ class _View:
         self._variance = float(np.average((_DELAYS - self.mean) ** 2, weights=weight))
         if self._variance < _APART_S**2 / 4.0:
             self._log_chance = None
-        shift, _ = self._shift(image, t, history)
+        shift, self.lasting = self._shift(image, t, history)
         return t + float(np.clip(shift, -_APART_S, _APART_S))
 
     def _followed(self, image: FloatArray, nominal: float, history: History) -> float:
         """Instant of a fresh image, s, by the present delay and the image; follow the delay."""
         expected, variance = nominal - self.mean, self._variance + self._jitter**2
         shift, sigma = self._shift(image, expected, history)
+        self.lasting = math.sqrt(self._variance)
         if not math.isfinite(sigma):
             return expected
         if abs(shift) > max(_APART_S, _GATE * math.sqrt(variance + sigma**2)):
@@ -314,7 +323,10 @@ class _View:
             gain = self._variance / (variance + _ALIKE * sigma**2)
             self.mean -= gain * shift
             self._variance = (1.0 - gain) * self._variance + _DRIFT_S**2
-        return expected + variance / (variance + sigma**2) * shift
+        share = variance / (variance + sigma**2)
+        # Errors of the model make images seem late, and are much the same from frame to frame.
+        self.lasting = math.hypot((1.0 - share) * self.lasting, share * sigma)
+        return expected + share * shift
 
     def _stray(self, image: FloatArray, nominal: float, history: History) -> None:
         """A frame that is far from its instant is another delay's, if it clearly fits that."""

@@ -341,6 +341,7 @@ class Contract(NamedTuple):
     time_offset_s: EachView | None  # time offset of the images of the cameras; None to estimate them
     settle_s: float | None  # time for which a user's robot has been at rest at the start
     identity: str = ""  # identity of the robot in the calibration's recording; may be empty
+    ideal: bool = False  # whether it is a simulated one whose images come with its readings
 
 
 @dataclass(frozen=True, eq=False)

@@ -69,7 +69,9 @@ def _known_of(scenario: RunScenario, contract: Contract, calibration: Calibratio
         sigma_px=scenario.world.noise_px,
         sigma_scale=calibration.sigma_scale or 1.0,
         sigma_q=scenario.world.joints.length_of(math.degrees(calibration.sigma_q or 0.0)),
-        delays=DelayPrior.of(calibration, None if given is None else [given.of(name) for name in views]),
+        delays=DelayPrior.of(
+            calibration, None if given is None else [given.of(name) for name in views], even=contract.ideal
+        ),
         timeout_s=contract.timeout_s,
         max_force_n=scenario.servo.stop.max_force_n,
     )

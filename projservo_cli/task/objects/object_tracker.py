@@ -68,7 +68,7 @@ class ObjectMotion(NamedTuple):
     E: FloatArray  # (g, 4, 4) generators about the middle of the object, in the calibrated frame as taught
     rates: FloatArray  # (g,) 1/s
     by_images: FloatArray  # (2 g, 2 g) covariance of displacement and rates by the images of the motion
-    by_calibration: FloatArray  # (2 g, c) errors by shape and calibration, which all frames share
+    by_calibration: FloatArray  # (2 g, c) errors by shape, calibration and latency, which all frames share
     speed_mm_s: float  # of its middle; NaN without a known length
     speed_px_s: float  # rms of its markers in all views
 
@@ -190,6 +190,7 @@ class ObjectTracker:
         self._acceleration, self._limit = acceleration * per_unit * lever, max_acceleration * per_unit * lever
         self._captured, self._seen_at = np.full(len(view), -math.inf), -math.inf
         self._left_out = np.zeros(len(view), dtype=bool)
+        self._late = 0.0  # deviation of the times that images share, s
         self._last = _Images(
             np.full((*weight.shape, 2), math.nan), np.zeros(weight.shape), np.zeros(len(view))
         )
@@ -220,12 +221,15 @@ class ObjectTracker:
         indices = [list(marker).index(number) for number in found.marker]
         return cls(found, c.view, indices, acceleration, max_acceleration, name)
 
-    def observe(self, t: FloatArray, s: FloatArray, sigma: FloatArray | None = None) -> None:
+    def observe(
+        self, t: FloatArray, s: FloatArray, sigma: FloatArray | None = None, late: FloatArray | None = None
+    ) -> None:
         """Take images of the views, each taken at another time.
 
         t : (V,) capture times, s; a view whose time is not later than before shows nothing new.
         s : (V, k, 2) px, NaN where unseen.
         sigma : (V, k) px; None, or NaN, is as calibrated, and then as residuals scatter.
+        late : (V,) deviation of the times, s, the same for images before and after; None is 0.
         """
         self._scatters = sigma is None or not np.isfinite(sigma).any()
         now = ObjectView(s[:, self._indices], None if sigma is None else sigma[:, self._indices])
@@ -245,6 +249,7 @@ class ObjectTracker:
         self.covered = Finding("covered_object", LIMITS, replace(self._of, views=views)) if views else None
         if not used.any():
             return
+        self._late = 0.0 if late is None else float(np.sqrt(np.mean(late[used] ** 2)))
         if math.isinf(dt := state.t - self._state.t):
             state, seen = state._replace(T=near.T), near
         else:
@@ -313,8 +318,11 @@ class ObjectTracker:
 
     def _shared_errors(self, t: float) -> FloatArray:
         """Errors (2 g, c) at a time, s, that all frames share."""
-        last = self._shared
-        return last.errors if math.isinf(last.t) else self._transition(last.rates, t - last.t) @ last.errors
+        last, errors = self._shared, self._shared.errors
+        if not math.isinf(last.t):
+            errors = self._transition(last.rates, t - last.t) @ errors
+        late = self._late * self._state.rates
+        return np.column_stack([errors, np.concatenate([late, np.zeros(len(late))])])
 
     def _sudden(self, dt: float) -> FloatArray:
         """Covariance (2 g, 2 g) that the largest acceleration adds in a time, s."""
