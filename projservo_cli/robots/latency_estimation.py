@@ -99,7 +99,7 @@ class DelayPrior(NamedTuple):
         view = calibration.view
         known = cls.unknown(len(view))
         if even:
-            known = known._replace(jitter=np.full(len(view), _LEAST_JITTER_S))
+            known = known._replace(jitter=np.zeros(len(view)))
         if (found := calibration.time_offset) is not None:
             sigma = np.maximum(
                 np.ptp(found.time_offset_interval_s, axis=1) / _INTERVAL, 0.5 * _LEAST_JITTER_S
@@ -211,7 +211,7 @@ class _View:
         mean, sigma, jitter = (float(both[view]) for both in prior)
         self.mean, self._variance, self._jitter, self._follows = mean, sigma**2, jitter, sigma > 0.0
         self.lasting = sigma  # deviation of the instants that frames share, s
-        blur = np.exp(-0.5 * (np.subtract.outer(_DELAYS, _DELAYS) / jitter) ** 2)
+        blur = np.exp(-0.5 * (np.subtract.outer(_DELAYS, _DELAYS) / max(jitter, _LEAST_JITTER_S)) ** 2)
         self._blur = blur / blur.sum(axis=1, keepdims=True)
         self._log_chance = self._open(mean, sigma)
         self._strays = 0

@@ -1,6 +1,7 @@
 """Set-points, where an arm that lags and sags rests behind them, and when images were taken."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -114,7 +115,7 @@ def motion(t):
     return np.stack([1.0 - np.cos(2.0 * t), np.sin(1.3 * t) * np.sin(0.4 * t)], axis=-1)
 
 
-def looks(delays, late, steps=60, stamped=None, noise=NOISE, first=-4, views=(0, 1)):
+def looks(delays, late, steps=60, stamped=None, noise=NOISE, first=-4, views=(0, 1), shift=0.0):
     """What comes of looking at a motion with images of views so late (V,); errors of the instants, s."""
     rng, history, off = np.random.default_rng(1), History(), []
     for k in range(first, steps):
@@ -122,7 +123,7 @@ def looks(delays, late, steps=60, stamped=None, noise=NOISE, first=-4, views=(0,
         history.add(now, motion(now))
         taken = now - np.asarray(late)
         s = np.stack([predicted(motion(t)[None])[0, view] for view, t in zip(views, taken, strict=True)])
-        s += noise * rng.standard_normal(s.shape)
+        s += noise * rng.standard_normal(s.shape) + shift
         stamps = np.full(len(views), np.nan) if stamped is None else taken + stamped
         off.append(delays.update(stamps, s, history).t - taken)
     return np.array(off)
@@ -136,6 +137,21 @@ def test_an_unknown_delay_is_found_as_soon_as_joints_move(late, clock):
     assert np.abs(off[20:]).max() < 0.01
     if clock is None:
         np.testing.assert_allclose(delays.mean, late, atol=0.004)
+
+
+@pytest.mark.parametrize("even", [True, False])
+def test_errors_of_the_model_tell_no_other_instant_where_there_is_none_and_are_stated_elsewhere(even):
+    """Images that are off by 5 px seem late or early by some milliseconds."""
+    exact = SimpleNamespace(view=VIEWS, time_offset=None)
+    delays = Delays(VIEWS, predicted, DelayPrior.of(exact, [0.0, 0.0], even=even), NOISE, 1.0, EXACT)
+    off = looks(delays, (0.0, 0.0), shift=5.0)
+    lasting = np.array([view.lasting for view in delays._views])
+    if even:
+        np.testing.assert_allclose(off, 0.0, atol=1e-15)
+        np.testing.assert_array_equal(lasting, 0.0)
+    else:
+        assert 0.003 < np.abs(off).max() < 0.03
+        assert (np.abs(off[-1]) < 3.0 * lasting).all()
 
 
 @pytest.mark.parametrize("late", [0.0, 0.08])

@@ -107,6 +107,22 @@ def off_mm(arm, motion, path, seed=1):
     return 1e3 * float(np.linalg.norm(apart[:3]))
 
 
+@pytest.mark.parametrize("path", [BELT, TABLE, SCREW], ids=["belt", "table", "screw"])
+def test_a_delay_that_is_not_known_moves_the_object_along_its_velocity_and_is_stated(path, arm, c):
+    """Images are 5 ms older than is said, and known to that."""
+    late, trackers = 0.005, [tracker_of(arm, c, path) for _ in range(2)]
+    for i in range(12):
+        s = seen_at(arm, path, np.full(2, i * PERIOD - late))
+        trackers[0].observe(np.full(2, i * PERIOD), s, SURE)
+        trackers[1].observe(np.full(2, i * PERIOD), s, SURE, late=np.full(2, late))
+    now, told = (tracker.at(11 * PERIOD) for tracker in trackers)
+    np.testing.assert_array_equal(told.D, now.D)
+    G = frame(1)
+    assert pytest.approx(G @ path(now.t - late) @ np.linalg.inv(G), abs=1e-6) == now.D
+    by_late = told.covariance - now.covariance
+    np.testing.assert_allclose(by_late, late**2 * np.outer(now.rates, now.rates), atol=1e-15)
+
+
 @pytest.mark.parametrize("ago", [(0.0, 0.0), (0.0, 0.002), (0.012, 0.0)], ids=str)
 @pytest.mark.parametrize("path", [STILL, BELT, TABLE, SCREW], ids=["still", "belt", "table", "screw"])
 def test_a_constant_twist_is_tracked_exactly(path, ago, arm, c):
