@@ -195,13 +195,13 @@ def test_a_goal_that_is_hidden_is_predicted_and_then_lost(monkeypatch):
     """Hidden for 0.4 s it is predicted; for longer than lost_s it is given up."""
     look = ObjectTracker.observe
 
-    def hand_before_one_camera(self, t, s, sigma=None):
-        look(self, t, np.where(t.max() > 2.0, s * [[[np.nan]], [[1.0]]], s), sigma)
+    def hand_before_one_camera(self, t, s, *further, **named):
+        look(self, t, np.where(t.max() > 2.0, s * [[[np.nan]], [[1.0]]], s), *further, **named)
 
     for seconds, verdict in ((0.4, "followed"), (9.0, "lost goal")):
 
-        def covered(self, t, s, sigma=None, hidden=seconds):
-            look(self, t, np.where(2.0 < t.max() < 2.0 + hidden, np.nan, s), sigma)
+        def covered(self, t, s, *further, hidden=seconds, **named):
+            look(self, t, np.where(2.0 < t.max() < 2.0 + hidden, np.nan, s), *further, **named)
 
         monkeypatch.setattr(ObjectTracker, "observe", covered)
         run = driven(moving(BELT))
@@ -231,9 +231,9 @@ def test_a_view_that_shows_something_else_is_left_out_and_said(monkeypatch):
     """A like tag held before the left camera for 0.5 s, 10 px beside."""
     look = ObjectTracker.observe
 
-    def held_before_it(self, t, s, sigma=None):
+    def held_before_it(self, t, s, *further, **named):
         off = 10.0 * (1.5 < t.max() < 2.0)
-        look(self, t, s + np.array([off, 0.0])[:, None, None] * [[[1.0, 0.0]]], sigma)
+        look(self, t, s + np.array([off, 0.0])[:, None, None] * [[[1.0, 0.0]]], *further, **named)
 
     monkeypatch.setattr(ObjectTracker, "observe", held_before_it)
     run = driven(moving(BELT))
