@@ -58,6 +58,7 @@ _FIRST_MODULES = {
 }
 # Fields that records had not at first: they count where they are not as by default, so that older keys hold.
 _ADDED: dict[str, dict[str, Any]] = {
+    "Contract": {"ideal": False},
     "Estimation": {"boards": (), "intrinsics": (), "focal_std_fraction": 0.005, "center_std_fraction": 0.01},
     "Markers": {"boards": None},
     **{name: {"staggered": False} for name in ("KnownBoard", "StatedBoard")},
