@@ -201,7 +201,7 @@ class DrivenRobot:
         sigma = np.full(s.shape[:2], max(self.known.sigma_px, MIN_SIGMA))
         if reading.sigma_objects is not None:
             sigma = reading.sigma_objects[:, indices]
-        tracker.observe(frames.t, s, sigma, late=frames.lasting)
+        tracker.observe(frames.t, s, sigma, sigma_t=frames.sigma_shared)
         if tracker.pushed is not None and not self.disturbance:
             self.disturbance = tracker.pushed
             self._retreat()

@@ -121,7 +121,7 @@ class Frames(NamedTuple):
     t: FloatArray  # (V,) s, by the clock of the readings
     sigma: FloatArray  # (V,) s, how well that was known before the images were looked at
     fresh: BoolArray  # (V,) whether the image is another one than before
-    lasting: FloatArray  # (V,) s, deviation of the instants that frames share
+    sigma_shared: FloatArray  # (V,) s, deviation of the instants that frames share
 
 
 def squares_by_joints(
@@ -172,8 +172,8 @@ class Delays:
             view.update(float(t), s, history) for view, t, s in zip(self._views, t_view, images, strict=True)
         ]
         t, sigma, fresh = zip(*found, strict=True)
-        lasting = np.array([view.lasting for view in self._views])
-        return Frames(np.array(t), np.array(sigma), np.array(fresh), lasting)
+        sigma_shared = np.array([view.sigma_shared for view in self._views])
+        return Frames(np.array(t), np.array(sigma), np.array(fresh), sigma_shared)
 
     def _reckon_with_joints(self, q: FloatArray) -> None:
         """Add the effect of errors of the readings at joints (n,) to the error of the model.
@@ -210,7 +210,7 @@ class _View:
         self.error_px, self._timeout_s = error_px, timeout_s
         mean, sigma, jitter = (float(both[view]) for both in prior)
         self.mean, self._variance, self._jitter, self._follows = mean, sigma**2, jitter, sigma > 0.0
-        self.lasting = sigma  # deviation of the instants that frames share, s
+        self.sigma_shared = sigma  # deviation of the instants that frames share, s
         blur = np.exp(-0.5 * (np.subtract.outer(_DELAYS, _DELAYS) / max(jitter, _LEAST_JITTER_S)) ** 2)
         self._blur = blur / blur.sum(axis=1, keepdims=True)
         self._log_chance = self._open(mean, sigma)
@@ -305,14 +305,15 @@ class _View:
         self._variance = float(np.average((_DELAYS - self.mean) ** 2, weights=weight))
         if self._variance < _APART_S**2 / 4.0:
             self._log_chance = None
-        shift, self.lasting = self._shift(image, t, history)
+        shift, sigma = self._shift(image, t, history)
+        self.sigma_shared = min(sigma, math.sqrt(self._variance))
         return t + float(np.clip(shift, -_APART_S, _APART_S))
 
     def _followed(self, image: FloatArray, nominal: float, history: History) -> float:
         """Instant of a fresh image, s, by the present delay and the image; follow the delay."""
         expected, variance = nominal - self.mean, self._variance + self._jitter**2
         shift, sigma = self._shift(image, expected, history)
-        self.lasting = math.sqrt(self._variance)
+        self.sigma_shared = math.sqrt(self._variance)
         if not math.isfinite(sigma):
             return expected
         if abs(shift) > max(_APART_S, _GATE * math.sqrt(variance + sigma**2)):
@@ -325,7 +326,7 @@ class _View:
             self._variance = (1.0 - gain) * self._variance + _DRIFT_S**2
         share = variance / (variance + sigma**2)
         # Errors of the model make images seem late, and are much the same from frame to frame.
-        self.lasting = math.hypot((1.0 - share) * self.lasting, share * sigma)
+        self.sigma_shared = math.hypot((1.0 - share) * self.sigma_shared, share * sigma)
         return expected + share * shift
 
     def _stray(self, image: FloatArray, nominal: float, history: History) -> None:

@@ -145,13 +145,21 @@ def test_errors_of_the_model_tell_no_other_instant_where_there_is_none_and_are_s
     exact = SimpleNamespace(view=VIEWS, time_offset=None)
     delays = Delays(VIEWS, predicted, DelayPrior.of(exact, [0.0, 0.0], even=even), NOISE, 1.0, EXACT)
     off = looks(delays, (0.0, 0.0), shift=5.0)
-    lasting = np.array([view.lasting for view in delays._views])
+    sigma_shared = np.array([view.sigma_shared for view in delays._views])
     if even:
         np.testing.assert_allclose(off, 0.0, atol=1e-15)
-        np.testing.assert_array_equal(lasting, 0.0)
+        np.testing.assert_array_equal(sigma_shared, 0.0)
     else:
         assert 0.003 < np.abs(off).max() < 0.03
-        assert (np.abs(off[-1]) < 3.0 * lasting).all()
+        assert (np.abs(off[-1]) < 3.0 * sigma_shared).all()
+
+
+def test_at_rest_the_deviation_of_instants_is_that_of_the_unknown_delay():
+    delays, history = Delays(VIEWS, predicted, DelayPrior.unknown(2), NOISE, 1.0, EXACT), History()
+    for k in range(3):
+        history.add(k * PERIOD, motion(0.0))
+        frames = delays.update(np.full(2, np.nan), predicted(motion(0.0)[None])[0] + 0.1 * k, history)
+        assert ((frames.sigma_shared > 0.15) & (frames.sigma_shared < 0.4)).all()
 
 
 @pytest.mark.parametrize("late", [0.0, 0.08])

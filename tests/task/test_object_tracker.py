@@ -114,7 +114,7 @@ def test_a_delay_that_is_not_known_moves_the_object_along_its_velocity_and_is_st
     for i in range(12):
         s = seen_at(arm, path, np.full(2, i * PERIOD - late))
         trackers[0].observe(np.full(2, i * PERIOD), s, SURE)
-        trackers[1].observe(np.full(2, i * PERIOD), s, SURE, late=np.full(2, late))
+        trackers[1].observe(np.full(2, i * PERIOD), s, SURE, sigma_t=np.full(2, late))
     now, told = (tracker.at(11 * PERIOD) for tracker in trackers)
     np.testing.assert_array_equal(told.D, now.D)
     G = frame(1)

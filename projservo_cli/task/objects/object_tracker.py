@@ -190,7 +190,7 @@ class ObjectTracker:
         self._acceleration, self._limit = acceleration * per_unit * lever, max_acceleration * per_unit * lever
         self._captured, self._seen_at = np.full(len(view), -math.inf), -math.inf
         self._left_out = np.zeros(len(view), dtype=bool)
-        self._late = 0.0  # deviation of the times that images share, s
+        self._sigma_t = 0.0  # deviation of the times that images share, s
         self._last = _Images(
             np.full((*weight.shape, 2), math.nan), np.zeros(weight.shape), np.zeros(len(view))
         )
@@ -222,14 +222,14 @@ class ObjectTracker:
         return cls(found, c.view, indices, acceleration, max_acceleration, name)
 
     def observe(
-        self, t: FloatArray, s: FloatArray, sigma: FloatArray | None = None, late: FloatArray | None = None
+        self, t: FloatArray, s: FloatArray, sigma: FloatArray | None = None, sigma_t: FloatArray | None = None
     ) -> None:
         """Take images of the views, each taken at another time.
 
         t : (V,) capture times, s; a view whose time is not later than before shows nothing new.
         s : (V, k, 2) px, NaN where unseen.
         sigma : (V, k) px; None, or NaN, is as calibrated, and then as residuals scatter.
-        late : (V,) deviation of the times, s, the same for images before and after; None is 0.
+        sigma_t : (V,) deviation of the times, s, of an error that all images share; None is 0.
         """
         self._scatters = sigma is None or not np.isfinite(sigma).any()
         now = ObjectView(s[:, self._indices], None if sigma is None else sigma[:, self._indices])
@@ -249,7 +249,7 @@ class ObjectTracker:
         self.covered = Finding("covered_object", LIMITS, replace(self._of, views=views)) if views else None
         if not used.any():
             return
-        self._late = 0.0 if late is None else float(np.sqrt(np.mean(late[used] ** 2)))
+        self._sigma_t = 0.0 if sigma_t is None else float(np.sqrt(np.mean(sigma_t[used] ** 2)))
         if math.isinf(dt := state.t - self._state.t):
             state, seen = state._replace(T=near.T), near
         else:
@@ -321,8 +321,8 @@ class ObjectTracker:
         last, errors = self._shared, self._shared.errors
         if not math.isinf(last.t):
             errors = self._transition(last.rates, t - last.t) @ errors
-        late = self._late * self._state.rates
-        return np.column_stack([errors, np.concatenate([late, np.zeros(len(late))])])
+        by_time = self._sigma_t * self._state.rates
+        return np.column_stack([errors, np.concatenate([by_time, np.zeros(len(by_time))])])
 
     def _sudden(self, dt: float) -> FloatArray:
         """Covariance (2 g, 2 g) that the largest acceleration adds in a time, s."""
