@@ -33,8 +33,8 @@ PACKAGE = ROOT / "projservo_cli"
 DESCRIBED = [path for path in PACKAGE.rglob("*.py") if "Parameters\n" in path.read_text(encoding="utf-8")]
 DOCSTRINGS = [PYTHON, "-m", "numpydoc", "lint", *sorted(map(str, DESCRIBED))]
 # Tests of compiled functions, once more without the compiler, where indices are looked at. Whole runs of all
-# laws are compared by tests/loop/test_bits.py. Of what objects are found by, lenses alone are compiled, and
-# tested in tests/geometry.
+# laws are compared by tests/loop/test_bits.py. Of the functions that find objects, those of lenses alone are
+# compiled, and tested in tests/geometry.
 MATHEMATICS = ["tests/geometry", "tests/task", "tests/control", "tests/simulation/test_ideal.py"]
 BY_NUMPY = ["tests/task/test_object_tracker.py", "tests/task/test_displaced_object.py"]
 UNCOMPILED = ["-m", "not volume", *MATHEMATICS, *(f"--ignore={path}" for path in BY_NUMPY)]
